@@ -1,0 +1,1 @@
+"""Neural Impostor in JAX: editable radiance fields on tetrahedral cages."""

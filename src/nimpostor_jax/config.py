@@ -1,0 +1,284 @@
+"""Static configuration: frozen, hashable dataclasses, checked when they are built.
+
+A config is an argument of `jax.jit` by value (static): a new value recompiles, an equal one does not.
+Arrays never live here. Each class is small and belongs to one stage of the pipeline.
+"""
+
+import dataclasses
+import math
+import types
+import typing
+from typing import Any, Literal, TypeVar
+
+Layout = Literal["per_simplex", "per_tet"]
+Interpolation = Literal["grid", "simplex"]
+Measure = Literal["barycentric", "alpha", "euclidean"]
+Background = Literal["white", "black", "random"]
+
+
+def _require(condition: bool, owner: object, name: str, rule: str) -> None:
+    if not condition:
+        value = getattr(owner, name)
+        raise ValueError(f"{type(owner).__name__}.{name} must be {rule}, got {value!r}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EncodingConfig:
+    """Multi-resolution hash encoding of barycentric coordinates (Sec. 3.3).
+
+    `layout` says who owns a grid node: `per_simplex` shares nodes on common vertices, edges and faces
+    (continuous field), `per_tet` gives each tet its own table (the paper's). `interpolation` is the
+    16-corner 4D `grid` of the paper or the 4-corner `simplex` of the edgewise subdivision.
+    """
+
+    layout: Layout = "per_simplex"
+    interpolation: Interpolation = "grid"
+    num_levels: int = 7
+    features_per_level: int = 2
+    base_resolution: int = 1
+    growth: float = 2.0
+    log2_table_size: int = 19  # H, the whole mesh's budget a level
+    min_log2_tet_table: int = 8
+    max_log2_tet_table: int = 11
+    log2_tet_table: int | None = None  # overrides the rule H' = clip(H - floor(log2 T + 1), min, max)
+    init_scale: float = 1e-2
+
+    def __post_init__(self) -> None:
+        _require(self.layout in typing.get_args(Layout), self, "layout", f"one of {typing.get_args(Layout)}")
+        _require(
+            self.interpolation in typing.get_args(Interpolation),
+            self, "interpolation", f"one of {typing.get_args(Interpolation)}",
+        )
+        _require(self.num_levels >= 1, self, "num_levels", ">= 1")
+        _require(self.features_per_level >= 1, self, "features_per_level", ">= 1")
+        _require(self.base_resolution >= 1, self, "base_resolution", ">= 1")
+        _require(self.growth >= 1.0, self, "growth", ">= 1")
+        _require(max(self.resolutions) <= 4096, self, "num_levels", "such that the finest resolution is <= 4096")
+        _require(
+            1 <= self.min_log2_tet_table <= self.max_log2_tet_table <= 20,
+            self, "min_log2_tet_table", "in [1, max_log2_tet_table <= 20]",
+        )
+        _require(
+            self.log2_tet_table is None or 1 <= self.log2_tet_table <= 20,
+            self, "log2_tet_table", "None or in [1, 20]",
+        )
+
+    @property
+    def resolutions(self) -> tuple[int, ...]:
+        """Grid resolution N_l = round(base * growth**l) of each level."""
+        return tuple(round(self.base_resolution * self.growth**level) for level in range(self.num_levels))
+
+    @property
+    def feature_dim(self) -> int:
+        """Length of the concatenated feature vector f_p (L * F)."""
+        return self.num_levels * self.features_per_level
+
+    def tet_table_size(self, num_tets: int) -> int:
+        """Entries 2**H' a tet and level (Sec. 3.3, corrected to stay in Sec. 5.1's range)."""
+        if self.log2_tet_table is not None:
+            return 1 << self.log2_tet_table
+        log2 = self.log2_table_size - math.floor(math.log2(num_tets) + 1)
+        return 1 << min(max(log2, self.min_log2_tet_table), self.max_log2_tet_table)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DecoderConfig:
+    """The two small MLPs of Eq. 7 (widths of Sec. 5.1) and the direction encoding of Eq. 6."""
+
+    density_hidden: int = 16
+    appearance_hidden: int = 64
+    appearance_layers: int = 2
+    sh_degree: int = 4  # D: D**2 spherical harmonics; 0 leaves the view direction out
+    density_bias: float = -1.0
+
+    def __post_init__(self) -> None:
+        _require(self.density_hidden >= 1, self, "density_hidden", ">= 1")
+        _require(self.appearance_hidden >= 1, self, "appearance_hidden", ">= 1")
+        _require(self.appearance_layers >= 1, self, "appearance_layers", ">= 1")
+        _require(0 <= self.sh_degree <= 4, self, "sh_degree", "in [0, 4]")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MarchConfig:
+    """Fixed sizes of the tet traversal (Sec. 3.4, Fig. 4). A change recompiles."""
+
+    max_tets_per_ray: int = 64  # K
+    max_entries_per_ray: int = 8  # times that a ray enters the cage from outside
+    tile_size: int | None = None  # rays marched together; None: 256 on CPU, the whole batch elsewhere
+
+    def __post_init__(self) -> None:
+        _require(self.max_tets_per_ray >= 1, self, "max_tets_per_ray", ">= 1")
+        _require(self.max_entries_per_ray >= 1, self, "max_entries_per_ray", ">= 1")
+        _require(self.tile_size is None or self.tile_size >= 1, self, "tile_size", "None or >= 1")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SamplerConfig:
+    """Placement of samples along a ray (Eqs. 3 to 5).
+
+    `step` is in units of `measure`: L1 barycentric distance (2 is a whole crossing, vertex to face), tets
+    crossed (`alpha`, Eq. 4 as printed), or length (`euclidean`, in units of the cage's own frame).
+    """
+
+    measure: Measure = "barycentric"
+    step: float = 0.125
+    cone_angle: float = 0.0  # theta of Eq. 4: step growth per unit of measure travelled
+    max_samples_per_ray: int = 128  # S; a longer ray gets larger steps and is reported
+    capacity_per_ray: int | None = None  # mean samples a ray in the packed buffer; None: S, no packing
+
+    def __post_init__(self) -> None:
+        _require(self.measure in typing.get_args(Measure), self, "measure", f"one of {typing.get_args(Measure)}")
+        _require(self.step > 0 and math.isfinite(self.step), self, "step", "> 0")
+        _require(self.cone_angle >= 0, self, "cone_angle", ">= 0")
+        _require(self.max_samples_per_ray >= 1, self, "max_samples_per_ray", ">= 1")
+        _require(
+            self.capacity_per_ray is None or 1 <= self.capacity_per_ray <= self.max_samples_per_ray,
+            self, "capacity_per_ray", "None or in [1, max_samples_per_ray]",
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderConfig:
+    """What the renderer does with the samples (Eqs. 1, 8, 9)."""
+
+    march: MarchConfig = MarchConfig()
+    sampler: SamplerConfig = SamplerConfig()
+    density_measure: Literal["barycentric", "euclidean"] = "barycentric"  # Eq. 9 or Eq. 8
+    near: float = 0.0  # in world units
+
+    def __post_init__(self) -> None:
+        _require(
+            self.density_measure in ("barycentric", "euclidean"),
+            self, "density_measure", "'barycentric' or 'euclidean'",
+        )
+        _require(self.near >= 0, self, "near", ">= 0")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ImpostorConfig:
+    """Everything static about a Neural Impostor's field."""
+
+    encoding: EncodingConfig = EncodingConfig()
+    decoder: DecoderConfig = DecoderConfig()
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DataConfig:
+    """How posed images are read."""
+
+    resolution: int | None = None  # target image width in pixels; None: as stored
+    background: Background = "white"  # of the reference images in evaluation
+    test_every: int = 8  # every n-th view is held out where there is no test split
+
+    def __post_init__(self) -> None:
+        _require(self.resolution is None or self.resolution >= 8, self, "resolution", "None or >= 8")
+        _require(self.background in ("white", "black"), self, "background", "'white' or 'black'")
+        _require(self.test_every >= 2, self, "test_every", ">= 2")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CageConfig:
+    """Cage construction from masks or from a surface mesh (Sec. 5.1)."""
+
+    target_tets: int = 350
+    grid_resolution: int = 128  # voxels along the longest side of the visual hull
+    margin: float = 0.02  # offset of the envelope from the object, as a share of its diagonal
+    max_missed_share: float = 0.001  # foreground pixels whose rays may miss the cage
+
+    def __post_init__(self) -> None:
+        _require(self.target_tets >= 6, self, "target_tets", ">= 6")
+        _require(self.grid_resolution >= 16, self, "grid_resolution", ">= 16")
+        _require(0 < self.margin < 0.5, self, "margin", "in (0, 0.5)")
+        _require(0 <= self.max_missed_share < 1, self, "max_missed_share", "in [0, 1)")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Optimisation of tables and decoders."""
+
+    steps: int = 2000
+    rays_per_batch: int = 4096
+    learning_rate: float = 1e-2
+    final_learning_rate: float = 1e-3
+    warmup_steps: int = 50
+    background: Background = "random"
+    seed: int = 0
+    log_every: int = 50
+    eval_every: int = 0  # 0: only at the end
+    checkpoint_every: int = 500
+
+    def __post_init__(self) -> None:
+        _require(self.steps >= 1, self, "steps", ">= 1")
+        _require(self.rays_per_batch >= 1, self, "rays_per_batch", ">= 1")
+        _require(self.learning_rate > 0, self, "learning_rate", "> 0")
+        _require(self.final_learning_rate > 0, self, "final_learning_rate", "> 0")
+        _require(self.warmup_steps >= 0, self, "warmup_steps", ">= 0")
+        _require(
+            self.background in typing.get_args(Background), self, "background", f"one of {typing.get_args(Background)}"
+        )
+        _require(self.log_every >= 1, self, "log_every", ">= 1")
+        _require(self.eval_every >= 0, self, "eval_every", ">= 0")
+        _require(self.checkpoint_every >= 1, self, "checkpoint_every", ">= 1")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExperimentConfig:
+    """One run: what the scripts read from gin files and save beside the checkpoint."""
+
+    data: DataConfig = DataConfig()
+    cage: CageConfig = CageConfig()
+    impostor: ImpostorConfig = ImpostorConfig()
+    render: RenderConfig = RenderConfig()
+    train: TrainConfig = TrainConfig()
+
+
+Config = TypeVar("Config")
+
+
+def to_dict(config: Any) -> dict[str, Any]:
+    """A config as nested plain dictionaries, JSON-ready."""
+    return dataclasses.asdict(config)
+
+
+def from_dict(cls: type[Config], values: dict[str, Any]) -> Config:
+    """Inverse of `to_dict`. Unknown keys and wrong types raise ValueError with the field's name."""
+    hints = typing.get_type_hints(cls)
+    unknown = sorted(set(values) - set(hints))
+    if unknown:
+        raise ValueError(f"{cls.__name__} has no field {unknown[0]!r}; fields: {', '.join(sorted(hints))}")
+    built = {}
+    for name, value in values.items():
+        if dataclasses.is_dataclass(hints[name]) and isinstance(value, dict):
+            value = from_dict(typing.cast(type, hints[name]), value)
+        built[name] = value
+    config = cls(**built)
+    check_types(config)
+    return config
+
+
+def check_types(config: Any) -> None:
+    """Raise TypeError naming the first field whose value is not of its annotated type (nested too)."""
+    for name, hint in typing.get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        if not _matches(value, hint):
+            expected = getattr(hint, "__name__", str(hint)).replace("typing.", "")
+            raise TypeError(
+                f"{type(config).__name__}.{name} must be {expected}, got {value!r} ({type(value).__name__})"
+            )
+        if dataclasses.is_dataclass(value):
+            check_types(value)
+
+
+def _matches(value: Any, hint: Any) -> bool:
+    origin = typing.get_origin(hint)
+    if origin is Literal:
+        return value in typing.get_args(hint)
+    if origin in (typing.Union, types.UnionType):
+        return any(_matches(value, option) for option in typing.get_args(hint))
+    if hint is type(None):
+        return value is None
+    if hint is float:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+    if hint is int:
+        return isinstance(value, int) and not isinstance(value, bool)
+    return isinstance(value, hint)

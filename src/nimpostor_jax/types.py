@@ -1,0 +1,116 @@
+"""Records that cross stage boundaries: pytrees of arrays, built and validated on the host.
+
+Axes: V vertices, T tets, R rays, K tet slots per ray, S samples per ray, L levels, F features per level.
+Units: `TetMesh.vertices` are in the cage's own frame (centre 0, half diagonal 1); `Rays` are in world units
+until `render.camera.to_local`. Barycentric coordinates and weights have no unit.
+
+Nothing is checked in here: `__post_init__` of a pytree class runs at every unflatten.
+"""
+
+from typing import Any
+
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int, UInt
+
+from nimpostor_jax.config import ImpostorConfig
+
+
+@struct.dataclass
+class BoundaryTree:
+    """Topology of a complete binary tree over the cage's boundary faces; boxes are refitted from vertices.
+
+    Leaf `i` holds `leaf_tets[i]` and `leaf_faces[i]`: tets and the local index of the corner opposite the
+    face, -1 in unused slots. Geometry is not stored, so a deformed mesh keeps its tree.
+    """
+
+    leaf_tets: Int[Array, "leaves width"]
+    leaf_faces: Int[Array, "leaves width"]
+
+
+@struct.dataclass
+class TetMesh:
+    """A tetrahedral cage in its own frame; `world = center + scale * vertices`."""
+
+    vertices: Float[Array, "V 3"]
+    tets: Int[Array, "T 4"]  # positively oriented
+    neighbors: Int[Array, "T 4"]  # across the face opposite corner i; -1 outside
+    object_ids: Int[Array, " T"]
+    boundary: BoundaryTree
+    center: Float[Array, " 3"]
+    scale: Float[Array, ""]
+
+
+@struct.dataclass
+class Camera:
+    """A pinhole camera, OpenGL axes (looks down -z, y up); pixel centres at half integers."""
+
+    camera_to_world: Float[Array, "*batch 4 4"]
+    focal: Float[Array, "*batch 2"]  # fx, fy in pixels
+    principal: Float[Array, "*batch 2"]  # cx, cy in pixels
+    width: int = struct.field(pytree_node=False)
+    height: int = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Rays:
+    """Points `origins + t * directions`; directions have length 1."""
+
+    origins: Float[Array, "*batch 3"]
+    directions: Float[Array, "*batch 3"]
+
+
+@struct.dataclass
+class TetSegments:
+    """The tets that each ray crosses, in order along the ray (Fig. 4)."""
+
+    tet_ids: Int[Array, "R K"]  # -1 marks an empty slot
+    entry_faces: Int[Array, "R K"]  # local index of the corner opposite the face that is entered
+    exit_faces: Int[Array, "R K"]
+    t_enter: Float[Array, "R K"]
+    t_exit: Float[Array, "R K"]
+    overflow: Bool[Array, " R"]  # more tets or entries than slots: the tail is missing
+
+
+@struct.dataclass
+class HashLayout:
+    """Which table entries a tet's grid nodes own (`paper/notes`: per_tet and per_simplex).
+
+    `regions[l][t, m]` packs offset * 32 + log2(size) of the region of level l in which tet t keeps the nodes
+    whose set of nonzero coordinates is the 4-bit mask m (one column where all masks share a region).
+    `dense_ranks[l]` is the collision-free index of each node where level l is stored densely, else None.
+    """
+
+    regions: tuple[Int[Array, "T masks"], ...]
+    multipliers: UInt[Array, "T 4"]  # hash factor of each corner
+    corner_order: Int[Array, "T 4"]  # the tet's corners by ascending vertex id
+    dense_ranks: tuple[Int[Array, " nodes"] | None, ...]
+
+
+@struct.dataclass
+class HashTables:
+    """Trainable features, one packed array a level, and the layout that addresses them."""
+
+    features: tuple[Float[Array, "entries F"], ...]
+    layout: HashLayout
+
+
+@struct.dataclass
+class NeuralImpostor:
+    """An editable radiance field: cage, tables, decoders (Sec. 3). A pytree of arrays and a static config."""
+
+    mesh: TetMesh
+    tables: HashTables
+    decoders: dict[str, Any]  # every leaf has a leading axis: the stack of decoder sets
+    decoder_index: Int[Array, " T"]  # which decoder set a tet uses
+    config: ImpostorConfig = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class RenderOutput:
+    """What a ray sees. `overflow`: its tets did not fit; `coarsened`: it got larger steps than asked for."""
+
+    color: Float[Array, "*batch 3"]  # premultiplied by opacity, without background
+    opacity: Float[Array, "*batch"]
+    depth: Float[Array, "*batch"]  # expected distance in world units; 0 where opacity is 0
+    overflow: Bool[Array, "*batch"]
+    coarsened: Bool[Array, "*batch"]
