@@ -16,15 +16,15 @@ from nimpostor_jax.config import ImpostorConfig
 
 
 @struct.dataclass
-class BoundaryTree:
-    """Topology of a complete binary tree over the cage's boundary faces; boxes are refitted from vertices.
+class BoundaryFaces:
+    """The cage's boundary faces in small clusters of neighbours, for culling; -1 fills unused slots.
 
-    Leaf `i` holds `leaf_tets[i]` and `leaf_faces[i]`: tets and the local index of the corner opposite the
-    face, -1 in unused slots. Geometry is not stored, so a deformed mesh keeps its tree.
+    `tets[c, i]` is the face's tet, `corners[c, i]` the local index of the corner opposite the face. Geometry
+    is not stored, so a deformed mesh keeps its clusters.
     """
 
-    leaf_tets: Int[Array, "leaves width"]
-    leaf_faces: Int[Array, "leaves width"]
+    tets: Int[Array, "clusters width"]
+    corners: Int[Array, "clusters width"]
 
 
 @struct.dataclass
@@ -35,7 +35,8 @@ class TetMesh:
     tets: Int[Array, "T 4"]  # positively oriented
     neighbors: Int[Array, "T 4"]  # across the face opposite corner i; -1 outside
     object_ids: Int[Array, " T"]
-    boundary: BoundaryTree
+    boundary: BoundaryFaces
+    tet_leaves: Int[Array, "leaves width"]  # tets in the leaves of a complete binary tree; -1 pads
     center: Float[Array, " 3"]
     scale: Float[Array, ""]
 
@@ -61,13 +62,16 @@ class Rays:
 
 @struct.dataclass
 class TetSegments:
-    """The tets that each ray crosses, in order along the ray (Fig. 4)."""
+    """The tets that each ray crosses, in order along the ray (Fig. 4). Slots may be empty anywhere.
+
+    Barycentric coordinates are affine along a ray, so the two ends give every point between (Eq. 3).
+    """
 
     tet_ids: Int[Array, "R K"]  # -1 marks an empty slot
-    entry_faces: Int[Array, "R K"]  # local index of the corner opposite the face that is entered
-    exit_faces: Int[Array, "R K"]
     t_enter: Float[Array, "R K"]
-    t_exit: Float[Array, "R K"]
+    t_exit: Float[Array, "R K"]  # never before t_enter
+    lambda_enter: Float[Array, "R K 4"]
+    lambda_exit: Float[Array, "R K 4"]
     overflow: Bool[Array, " R"]  # more tets or entries than slots: the tail is missing
 
 

@@ -1,0 +1,163 @@
+"""Who owns a grid node: packed table regions per tet, or per vertex, edge, face and tet (Sec. 3.3).
+
+Level l puts a 4D grid of resolution N over the barycentric coordinates of every tet. Only nodes near the
+plane sum(u) = N are ever read: N - 3 <= sum(u) <= N + 3 by the 16 corners of a voxel, sum(u) = N by the
+4 corners of a simplex. The set of a node's nonzero coordinates, its 4-bit mask, names the sub-simplex of the
+tet on which it lies. `per_tet` gives all masks of a tet one region (the paper's tables); `per_simplex` gives
+one to each sub-simplex of the mesh, which all tets around it share: the field is then continuous.
+
+Nodes of a level that fit are numbered without collisions (`dense_ranks`); otherwise they are hashed within
+their region. Host code, NumPy.
+"""
+
+import itertools
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Int
+
+from nimpostor_jax.config import EncodingConfig
+from nimpostor_jax.types import HashLayout
+
+NGP_PRIMES = (1, 2654435761, 805459861, 3674653429)  # Instant-NGP's, and one more for the fourth coordinate
+DENSE_RESOLUTION_LIMIT = 16  # (N + 1)^4 numbers a level must stay small beside the tables
+SIZE_BITS = 5  # a region is packed as offset << SIZE_BITS | log2(size)
+
+
+def slab_half_width(config: EncodingConfig) -> int:
+    """How far from the plane sum(u) = N the interpolation reads."""
+    return 3 if config.interpolation == "grid" else 0
+
+
+def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> tuple[HashLayout, tuple[int, ...]]:
+    """The layout for a mesh's tets and the number of entries of each level."""
+    tets = np.asarray(tets)
+    if config.layout == "per_tet":
+        regions, entries, ranks = _per_tet(len(tets), config)
+        multipliers = np.broadcast_to(np.array(NGP_PRIMES, np.uint32), tets.shape)
+        order = np.broadcast_to(np.arange(4), tets.shape)
+    else:
+        order = np.argsort(tets, axis=1)
+        ascending = np.take_along_axis(tets, order, axis=1)
+        regions, entries, ranks = _per_simplex(ascending, config)
+        multipliers = _vertex_multipliers(ascending)
+    layout = HashLayout(
+        regions=tuple(jnp.asarray(r, jnp.int32) for r in regions),
+        multipliers=jnp.asarray(multipliers, jnp.uint32),
+        corner_order=jnp.asarray(order, jnp.int32),
+        dense_ranks=tuple(None if r is None else jnp.asarray(r, jnp.int32) for r in ranks),
+    )
+    return layout, tuple(entries)
+
+
+def _per_tet(num_tets: int, config: EncodingConfig) -> tuple[list, list, list]:
+    size = config.tet_table_size(num_tets)
+    regions, entries, ranks = [], [], []
+    for resolution in config.resolutions:
+        rank = _dense_ranks(resolution, slab_half_width(config), by_mask=False)
+        if rank is not None and rank.max() < size:
+            count, log2 = int(rank.max()) + 1, 0
+        else:
+            rank, count, log2 = None, size, size.bit_length() - 1
+        regions.append(((np.arange(num_tets) * count) << SIZE_BITS | log2)[:, None])
+        entries.append(num_tets * count)
+        ranks.append(rank)
+    return regions, entries, ranks
+
+
+def _per_simplex(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> tuple[list, list, list]:
+    """Regions [T, 16] by mask. Each level gets at most the entries that `per_tet` would have."""
+    ids, counts = _sub_simplices(tets)
+    budget = len(tets) * config.tet_table_size(len(tets))
+    regions, entries, ranks = [], [], []
+    for resolution in config.resolutions:
+        nodes = _nodes_by_dimension(resolution, slab_half_width(config))
+        rank = _dense_ranks(resolution, slab_half_width(config), by_mask=True)
+        if rank is not None and 1 + sum(n * c for n, c in zip(nodes, counts, strict=True)) <= budget:
+            sizes, log2 = nodes, [0] * 4
+        else:
+            rank = None
+            log2 = _hashed_sizes(nodes, counts, budget)
+            sizes = [1 << bits for bits in log2]
+        bases = np.concatenate([[1], 1 + np.cumsum([s * c for s, c in zip(sizes, counts, strict=True)])])
+        packed = np.zeros((len(tets), 16), np.int64)  # mask 0, the all-zero node, is entry 0 of the level
+        for mask in range(1, 16):
+            dimension = mask.bit_count() - 1
+            offset = bases[dimension] + ids[:, mask] * sizes[dimension]
+            packed[:, mask] = offset << SIZE_BITS | log2[dimension]
+        regions.append(packed)
+        entries.append(int(bases[-1]))
+        ranks.append(rank)
+    return regions, entries, ranks
+
+
+def _hashed_sizes(nodes: list[int], counts: list[int], budget: int) -> list[int]:
+    """log2 of the region size of a vertex, edge, face and tet: as large as the budget allows.
+
+    A sub-simplex never gets more than its nodes need. Sizes grow in turn, always the one whose nodes
+    collide most, so that features are about equally shared everywhere.
+    """
+    log2 = [min(2, max(0, (n - 1).bit_length())) for n in nodes]
+    growing = {0, 1, 2, 3}
+    while growing:
+        crowded = max(growing, key=lambda d: nodes[d] / (1 << log2[d]))
+        grown = [bits + (d == crowded) for d, bits in enumerate(log2)]
+        total = 1 + sum(c << bits for c, bits in zip(counts, grown, strict=True))
+        if nodes[crowded] <= 1 << log2[crowded] or total > budget:
+            growing.remove(crowded)
+        else:
+            log2 = grown
+    return log2
+
+
+def _sub_simplices(tets: Int[np.ndarray, "T 4"]) -> tuple[Int[np.ndarray, "T 16"], list[int]]:
+    """The number of each tet's sub-simplex among all of its dimension, by mask, and how many there are."""
+    ids = np.zeros((len(tets), 16), np.int64)
+    counts = []
+    for size in range(1, 5):
+        masks = [sum(1 << i for i in corners) for corners in itertools.combinations(range(4), size)]
+        corners = [list(c) for c in itertools.combinations(range(4), size)]
+        simplices = np.stack([tets[:, c] for c in corners], axis=1).reshape(-1, size)
+        unique, inverse = np.unique(simplices, axis=0, return_inverse=True)
+        ids[:, masks] = inverse.reshape(len(tets), len(masks))
+        counts.append(len(unique))
+    return ids, counts
+
+
+def _nodes_by_dimension(resolution: int, half_width: int) -> list[int]:
+    """How many nodes near the plane have 1, 2, 3, 4 given coordinates nonzero (each at most N)."""
+    counts = []
+    ways = np.array([1], dtype=object)  # ways[s]: tuples with sum s
+    single = np.array([0] + [1] * resolution, dtype=object)
+    for _ in range(4):
+        ways = np.convolve(ways, single)
+        counts.append(int(sum(ways[max(resolution - half_width, 0) : resolution + half_width + 1])))
+    return counts
+
+
+def _dense_ranks(resolution: int, half_width: int, by_mask: bool) -> Int[np.ndarray, " nodes"] | None:
+    """A number for every node of the (N+1)^4 grid, flattened with the first coordinate fastest.
+
+    Nodes near the plane are counted from 0, within their mask where `by_mask`; others get 0. Equal nonzero
+    coordinates get equal numbers whatever the mask, so tets on two sides of a face agree. None if N is large.
+    """
+    if resolution > DENSE_RESOLUTION_LIMIT:
+        return None
+    axis = np.arange(resolution + 1)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, axis, indexing="ij")[::-1], axis=-1).reshape(-1, 4)
+    reachable = np.abs(nodes.sum(axis=1) - resolution) <= half_width
+    masks = (nodes > 0) @ (1 << np.arange(4))
+    ranks = np.zeros(len(nodes), np.int64)
+    for mask in range(16) if by_mask else [None]:
+        chosen = np.flatnonzero(reachable & (masks == mask) if by_mask else reachable)
+        ranks[chosen] = np.arange(len(chosen))
+    return ranks
+
+
+def _vertex_multipliers(tets: Int[np.ndarray, "T 4"]) -> np.ndarray:
+    """A hash factor per mesh vertex, odd: a sub-simplex then hashes alike from all tets around it."""
+    bits = tets.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):  # splitmix64's finaliser
+        bits = (bits ^ (bits >> np.uint64(shift))) * np.uint64(factor)
+    return ((bits ^ (bits >> np.uint64(31))) & np.uint64(0xFFFFFFFF)).astype(np.uint32) | np.uint32(1)
+

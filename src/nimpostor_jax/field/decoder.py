@@ -1,0 +1,82 @@
+"""The two small decoders of Eq. 7: density from features, colour from features and view direction.
+
+Parameters are plain dictionaries; every leaf has a leading axis over decoder sets, so that a locally edited
+region can own its copy (Sec. 4.2). Axes: D decoder sets, M points.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from nimpostor_jax.config import ImpostorConfig
+
+MAX_LOG_DENSITY = 40.0  # exp(40) is opaque in any scene and far from float32's overflow
+MAX_LOG_GRADIENT = 15.0
+Parameters = dict[str, Any]
+
+
+@jax.custom_jvp
+def truncated_exp(x: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """exp(x), bounded; its gradient is bounded earlier, so that one dense sample cannot blow up a step."""
+    return jnp.exp(jnp.minimum(x, MAX_LOG_DENSITY))
+
+
+@truncated_exp.defjvp
+def _truncated_exp_jvp(primals, tangents):  # type: ignore[no-untyped-def]
+    (x,), (dx,) = primals, tangents
+    return truncated_exp(x), jnp.exp(jnp.clip(x, -MAX_LOG_GRADIENT, MAX_LOG_GRADIENT)) * dx
+
+
+def init_decoders(key: Array, config: ImpostorConfig, num_sets: int = 1) -> Parameters:
+    """He-initialised weights, zero biases; the last density bias is the config's (space starts thin)."""
+    decoder = config.decoder
+    features = config.encoding.feature_dim
+    hidden = decoder.appearance_hidden
+    widths = {
+        "density": [features, decoder.density_hidden, 1],
+        "appearance": [features + decoder.sh_degree**2, *[hidden] * decoder.appearance_layers, 3],
+    }
+    parameters: Parameters = {}
+    for name, sizes in widths.items():
+        layers = []
+        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+            key, layer_key = jax.random.split(key)
+            weight = jax.random.normal(layer_key, (num_sets, fan_in, fan_out)) * (2 / fan_in) ** 0.5
+            layers.append({"weight": weight, "bias": jnp.zeros((num_sets, fan_out))})
+        parameters[name] = layers
+    parameters["density"][-1]["bias"] += decoder.density_bias
+    return parameters
+
+
+def decode_density(
+    parameters: Parameters, features: Float[Array, "M C"], decoder_ids: Int[Array, " M"]
+) -> Float[Array, " M"]:
+    """Density D_sigma(f_p) >= 0 per unit of the density measure (Eq. 7)."""
+    return truncated_exp(_apply(parameters["density"], features, decoder_ids)[..., 0])
+
+
+def decode_appearance(
+    parameters: Parameters,
+    features: Float[Array, "M C"],
+    direction_features: Float[Array, "M E"],
+    decoder_ids: Int[Array, " M"],
+) -> Float[Array, "M 3"]:
+    """Colour D_r(f_p + f_d) in [0, 1] (Eq. 7)."""
+    inputs = jnp.concatenate([features, direction_features], axis=-1)
+    return jax.nn.sigmoid(_apply(parameters["appearance"], inputs, decoder_ids))
+
+
+def _apply(layers: list, inputs: Float[Array, "M C"], decoder_ids: Int[Array, " M"]) -> Float[Array, "M out"]:
+    num_sets = layers[0]["weight"].shape[0]
+    outputs = _mlp(layers, 0, inputs)
+    for chosen in range(1, num_sets):
+        outputs = jnp.where(decoder_ids[:, None] == chosen, _mlp(layers, chosen, inputs), outputs)
+    return outputs
+
+
+def _mlp(layers: list, chosen: int, inputs: Float[Array, "M C"]) -> Float[Array, "M out"]:
+    for layer in layers[:-1]:
+        inputs = jax.nn.relu(inputs @ layer["weight"][chosen] + layer["bias"][chosen])
+    return inputs @ layers[-1]["weight"][chosen] + layers[-1]["bias"][chosen]

@@ -1,0 +1,57 @@
+"""The field: from a point in a tet to features, density and colour (Eqs. 6 and 7)."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nimpostor_jax.config import ImpostorConfig
+from nimpostor_jax.encoding.hash_grid import encode, init_features
+from nimpostor_jax.encoding.layout import build_layout
+from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
+from nimpostor_jax.field.decoder import decode_appearance, decode_density, init_decoders
+from nimpostor_jax.types import HashTables, NeuralImpostor, TetMesh
+
+
+def init_impostor(key: Array, mesh: TetMesh, config: ImpostorConfig) -> NeuralImpostor:
+    """An untrained impostor on a cage: packed tables, one decoder set. Host code (the layout is built once)."""
+    table_key, decoder_key = jax.random.split(key)
+    layout, entries = build_layout(np.asarray(mesh.tets), config.encoding)
+    return NeuralImpostor(
+        mesh=mesh,
+        tables=HashTables(features=init_features(table_key, entries, config.encoding), layout=layout),
+        decoders=init_decoders(decoder_key, config),
+        decoder_index=jnp.zeros(mesh.tets.shape[0], jnp.int32),
+        config=config,
+    )
+
+
+def features(
+    impostor: NeuralImpostor, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+) -> Float[Array, "M C"]:
+    """Position features f_p (Eq. 6)."""
+    return encode(impostor.tables, impostor.config.encoding, tet_ids, lambdas)
+
+
+def density(
+    impostor: NeuralImpostor, tet_ids: Int[Array, " M"], point_features: Float[Array, "M C"]
+) -> Float[Array, " M"]:
+    """Density per unit of the density measure, from features (Eq. 7)."""
+    return decode_density(impostor.decoders, point_features, impostor.decoder_index[tet_ids])
+
+
+def radiance(
+    impostor: NeuralImpostor,
+    tet_ids: Int[Array, " M"],
+    point_features: Float[Array, "M C"],
+    direction_features: Float[Array, "M E"],
+) -> Float[Array, "M 3"]:
+    """Colour from features and encoded view direction (Eq. 7)."""
+    return decode_appearance(
+        impostor.decoders, point_features, direction_features, impostor.decoder_index[tet_ids]
+    )
+
+
+def encode_directions(impostor: NeuralImpostor, directions: Float[Array, "R 3"]) -> Float[Array, "R E"]:
+    """Spherical harmonics of the view directions f_d (Eq. 6)."""
+    return spherical_harmonics(directions, impostor.config.decoder.sh_degree)

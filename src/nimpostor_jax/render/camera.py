@@ -1,0 +1,31 @@
+"""Pinhole cameras and rays. OpenGL axes: the camera looks down -z, y is up; pixel centres at half integers."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nimpostor_jax.types import Camera, Rays, TetMesh
+
+
+def pixel_rays(camera: Camera, pixels: Float[Array, "*batch 2"]) -> Rays:
+    """World-space rays through pixel positions (x right, y down, in pixels; a pixel's centre is at + 0.5).
+
+    Camera fields broadcast against the pixels' leading axes. Differentiable in the camera and the pixels.
+    """
+    offset = (pixels - camera.principal) / camera.focal
+    x, y = offset[..., 0], -offset[..., 1]
+    rotation = camera.camera_to_world[..., :3, :3]
+    directions = rotation[..., 0] * x[..., None] + rotation[..., 1] * y[..., None] - rotation[..., 2]
+    norm = jnp.sqrt(jnp.sum(directions**2, axis=-1, keepdims=True))
+    origins = jnp.broadcast_to(camera.camera_to_world[..., :3, 3], directions.shape)
+    return Rays(origins=origins, directions=directions / norm)
+
+
+def image_pixels(height: int, width: int) -> Float[Array, "height width 2"]:
+    """Centres of all pixels of an image."""
+    y, x = jnp.meshgrid(jnp.arange(height) + 0.5, jnp.arange(width) + 0.5, indexing="ij")
+    return jnp.stack([x, y], axis=-1)
+
+
+def to_local(mesh: TetMesh, rays: Rays) -> Rays:
+    """World rays in the mesh's own frame; t shrinks by `mesh.scale`, directions keep length 1."""
+    return Rays(origins=(rays.origins - mesh.center) / mesh.scale, directions=rays.directions)

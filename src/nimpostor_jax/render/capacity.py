@@ -1,0 +1,82 @@
+"""Buffer sizes from the scene: the host-side answer to fixed-size buffers.
+
+A config's capacities are upper bounds that fit most scenes. These helpers measure a scene's rays once and
+return a config with just the slots that it needs; what still overflows is flagged per ray and handled by the
+caller.
+"""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from nimpostor_jax.config import MarchConfig, RenderConfig
+from nimpostor_jax.render.camera import to_local
+from nimpostor_jax.render.sampling import segment_measure, step_boundaries
+from nimpostor_jax.render.segments import locate_segments
+from nimpostor_jax.render.traverse import MarchTables, traverse
+from nimpostor_jax.types import Rays, TetMesh
+
+MAX_GROWTH = 6  # doublings of a buffer before giving up
+
+
+@partial(jax.jit, static_argnames="config")
+def rays_hit(mesh: TetMesh, tables: MarchTables, rays: Rays, config: MarchConfig) -> Bool[Array, " R"]:
+    """Which world-space rays' lines meet the cage at all."""
+    first_only = dataclasses.replace(config, max_tets_per_ray=1, max_entries_per_ray=1)
+    return traverse(tables, to_local(mesh, rays), first_only).codes[:, 0] >= 0
+
+
+@partial(jax.jit, static_argnames="config")
+def _demand(
+    mesh: TetMesh, tables: MarchTables, rays: Rays, config: RenderConfig
+) -> tuple[Int[Array, ""], Bool[Array, ""], Float[Array, " R"]]:
+    local = to_local(mesh, rays)
+    crossings = traverse(tables, local, config.march)
+    segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
+    total = jnp.sum(segment_measure(segments, config.sampler.measure), axis=1)
+    return jnp.max(jnp.sum(crossings.codes >= 0, axis=1)), jnp.any(crossings.overflow), total
+
+
+def fit_capacities(
+    mesh: TetMesh, tables: MarchTables, rays: Rays, config: RenderConfig, *, margin: float = 1.25
+) -> RenderConfig:
+    """A config whose buffers hold these sample rays (drawn like those to come), with a margin.
+
+    Slots are rounded up to multiples of 8; `max_samples_per_ray` of the given config stays the limit.
+    Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
+    """
+    for _ in range(MAX_GROWTH):
+        most_tets, overflow, total = _demand(mesh, tables, rays, config)
+        if not overflow:
+            break
+        config = grow_march(config)
+    else:
+        raise ValueError(
+            f"a ray crosses more than {config.march.max_tets_per_ray} tets or enters the cage more than "
+            f"{config.march.max_entries_per_ray} times; raise MarchConfig.max_tets_per_ray and max_entries_per_ray"
+        )
+    boundaries = step_boundaries(config.sampler)
+    wanted = np.clip(np.searchsorted(boundaries, np.asarray(total) * (1 - 1e-5)), 0, len(boundaries) - 1)
+    most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
+    mean = min(most, int(np.ceil(margin * wanted.mean())) + 1)
+    march = dataclasses.replace(config.march, max_tets_per_ray=_round_up(margin * int(most_tets)))
+    sampler = dataclasses.replace(config.sampler, max_samples_per_ray=most, capacity_per_ray=mean)
+    return dataclasses.replace(config, march=march, sampler=sampler)
+
+
+def grow_march(config: RenderConfig) -> RenderConfig:
+    """Twice the tet slots and entries."""
+    march = dataclasses.replace(
+        config.march,
+        max_tets_per_ray=2 * config.march.max_tets_per_ray,
+        max_entries_per_ray=2 * config.march.max_entries_per_ray,
+    )
+    return dataclasses.replace(config, march=march)
+
+
+def _round_up(value: float) -> int:
+    return max(8, int(-(-value // 8)) * 8)

@@ -1,0 +1,63 @@
+"""From rays to colours: traverse, sample, encode, decode, composite (Figs. 2 and 4, Eqs. 8 and 9)."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.field import impostor as field
+from nimpostor_jax.render.camera import to_local
+from nimpostor_jax.render.composite import sample_weights
+from nimpostor_jax.render.sampling import Samples, sample_segments, to_grid
+from nimpostor_jax.render.segments import locate_segments
+from nimpostor_jax.render.traverse import MarchTables, march_tables, traverse
+from nimpostor_jax.types import NeuralImpostor, Rays, RenderOutput
+
+
+def render_rays(
+    impostor: NeuralImpostor,
+    rays: Rays,
+    config: RenderConfig,
+    jitter: Float[Array, " R"] | None = None,
+    tables: MarchTables | None = None,
+) -> RenderOutput:
+    """Colour, opacity and depth of rays [R] given in world space. Pure; jit it with `config` static.
+
+    Differentiable in every array of the impostor (tables, decoders, vertices) and in the rays. With `jitter`
+    in [0, 1) samples move within their steps (training); without, they sit in the middle. Pass `tables` to
+    spare rearranging the mesh in every call; by default they are made from the mesh's current vertices.
+    """
+    local = to_local(impostor.mesh, rays)
+    near = config.near / impostor.mesh.scale
+    if tables is None:
+        tables = march_tables(impostor.mesh)
+    crossings = traverse(tables, local, config.march)
+    segments = locate_segments(impostor.mesh, local, crossings, near)
+    samples = sample_segments(segments, config.sampler, config.density_measure, jitter)
+    return _integrate(impostor, local, samples, segments.overflow, config)
+
+
+def _integrate(
+    impostor: NeuralImpostor, rays: Rays, samples: Samples, overflow: Array, config: RenderConfig
+) -> RenderOutput:
+    max_samples = config.sampler.max_samples_per_ray
+    point_features = field.features(impostor, samples.tet_ids, samples.lambdas)
+    sigmas = field.density(impostor, samples.tet_ids, point_features)
+    directions = field.encode_directions(impostor, rays.directions)[samples.rays]
+    colors = field.radiance(impostor, samples.tet_ids, point_features, directions)
+
+    def grid(values: Float[Array, "M *rest"]) -> Float[Array, "R S *rest"]:
+        return to_grid(values, samples, max_samples)
+
+    weights = sample_weights(grid(sigmas), grid(samples.deltas))
+    opacity = jnp.sum(weights, axis=-1)
+    depth = jnp.sum(weights * grid(samples.t), axis=-1)
+    visible = opacity > 0
+    return RenderOutput(
+        color=jnp.sum(weights[..., None] * grid(colors), axis=-2),
+        opacity=opacity,
+        depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * impostor.mesh.scale,
+        overflow=overflow | samples.overflow,
+        coarsened=samples.coarsened,
+    )
+

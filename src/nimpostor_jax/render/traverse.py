@@ -1,0 +1,272 @@
+"""Ray traversal of a tetrahedral cage with fixed-size buffers (Sec. 3.4, Fig. 4).
+
+A ray enters the cage through front-facing boundary faces; a tile of rays culls clusters of them together by a
+cone. From each entry it walks from tet to tet through common faces (Fig. 4, adjacent), leaves through a
+boundary face and goes on at the next entry (separated). The walk carries the triangle through which it came,
+projected along the ray: one new vertex and three edge tests decide the way out (Aman et al. 2021), and since
+a tet is always left by another face than it was entered by, flat and inverted tets are passed as well.
+
+A crossing is coded as 9 * (4 tet + f) + 3 r + s: the tet was entered by the face opposite corner f, whose
+corners the walk holds in the order FACES[f] rotated by r, and left by the face without the s-th of these.
+
+Axes: R rays, K tet slots, B entries, T tets; inside a tile the rays (lanes) are the last axis.
+The walk is integer work; `segments.locate_segments` derives differentiable coordinates from its codes.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Bool, Float, Int
+
+from nimpostor_jax.config import MarchConfig
+from nimpostor_jax.geometry.intersect import face_weights, passes_left, project, ray_frame
+from nimpostor_jax.geometry.tetrahedron import FACES
+from nimpostor_jax.types import Rays, TetMesh
+
+CPU_TILE = 1024  # measured: smaller tiles pay per kernel, larger ones leave the cache and wait for stragglers
+CODES_PER_TET = 36
+
+
+def _code_tables() -> tuple[np.ndarray, np.ndarray]:
+    """For the 36 codes of a tet: the face left, and the held corners after it, (new, next, next but one)."""
+    exit_faces = np.zeros(CODES_PER_TET, np.int32)
+    triangles = np.zeros((CODES_PER_TET, 3), np.int32)
+    for face, rotation, slot in np.ndindex(4, 3, 3):
+        held = np.roll(FACES[face], -rotation)
+        code = 9 * face + 3 * rotation + slot
+        exit_faces[code] = held[slot]
+        triangles[code] = face, held[(slot + 1) % 3], held[(slot + 2) % 3]
+    return exit_faces, triangles
+
+
+EXIT_FACES, EXIT_TRIANGLES = _code_tables()
+
+
+@struct.dataclass
+class MarchTables:
+    """The mesh's current geometry, rearranged for marching: made once, used for many calls."""
+
+    corners: Float[Array, "3 4T"]  # positions of the corners, column 4 tet + corner
+    next_holds: Int[Array, " 36T"]  # by code: 3 * (4 tet + f) + r on the other side; -1 outside
+    face_corners: Float[Array, "clusters width 3 3"]  # boundary faces, as seen from outside
+    face_holds: Int[Array, "clusters width"]  # 3 * (4 tet + f); -1 pads
+    cluster_centers: Float[Array, "clusters 3"]
+    cluster_radii: Float[Array, " clusters"]  # negative for empty clusters
+
+
+@struct.dataclass
+class Crossings:
+    """The tets that each ray's line crosses, as codes, in order along the line."""
+
+    codes: Int[Array, "R K"]  # -1 marks an empty slot
+    overflow: Bool[Array, " R"]  # more tets or entries than slots
+
+
+def march_tables(mesh: TetMesh) -> MarchTables:
+    """Gather what `traverse` reads from the mesh; call again when vertices have moved."""
+    vertices = jax.lax.stop_gradient(mesh.vertices)
+    used = mesh.boundary.tets >= 0
+    tets, corners = jnp.maximum(mesh.boundary.tets, 0), jnp.maximum(mesh.boundary.corners, 0)
+    triangles = vertices[mesh.tets[tets[..., None], jnp.asarray(FACES, jnp.int32)[corners]]]
+    mask = used[..., None, None]
+    low = jnp.min(jnp.where(mask, triangles, jnp.inf), axis=(1, 2))
+    high = jnp.max(jnp.where(mask, triangles, -jnp.inf), axis=(1, 2))
+    occupied = jnp.any(used, axis=1)
+    centers = jnp.where(occupied[:, None], (low + high) / 2, 0)
+    radii = jnp.sqrt(jnp.sum(jnp.where(occupied[:, None], (high - low) / 2, 0) ** 2, axis=-1))
+    return MarchTables(
+        corners=vertices[mesh.tets.reshape(-1)].T,
+        next_holds=_next_holds(mesh.tets, mesh.neighbors),
+        face_corners=triangles,
+        face_holds=jnp.where(used, 3 * (4 * tets + corners), -1),
+        cluster_centers=centers,
+        cluster_radii=jnp.where(occupied, radii, -1),
+    )
+
+
+def _next_holds(tets: Int[Array, "T 4"], neighbors: Int[Array, "T 4"]) -> Int[Array, " 36T"]:
+    """Where each code leads: the neighbour, the face it is entered by, and the rotation of its corners."""
+    columns = []
+    rotated = np.array([[np.roll(face, -r) for r in range(3)] for face in FACES])  # [face, rotation, 3]
+    for exit_face, triangle in zip(EXIT_FACES, EXIT_TRIANGLES, strict=True):
+        neighbor = neighbors[:, exit_face]
+        other = tets[jnp.maximum(neighbor, 0)]
+        held = tets[:, triangle]  # [T, 3], in the order that the walk holds them
+        matches = jnp.all(other[:, rotated] == held[:, None, None, :], axis=-1)  # [T, face, rotation]
+        column = 12 * neighbor + jnp.argmax(matches.reshape(-1, 12), axis=1)
+        columns.append(jnp.where(neighbor >= 0, column, -1))
+    return jnp.stack(columns, axis=1).reshape(-1).astype(jnp.int32)
+
+
+def traverse(tables: MarchTables, rays: Rays, config: MarchConfig) -> Crossings:
+    """The tets that the line of each ray crosses, in order; rays [R] in the mesh's own frame.
+
+    Memory is rays x slots, never rays x tets. `overflow` marks rays with more tets or entries than the
+    config has slots for; their crossings are complete up to there. Tets behind a ray's origin use slots too.
+    """
+    num_rays = rays.origins.shape[0]
+    default = CPU_TILE if jax.default_backend() == "cpu" else num_rays
+    tile = max(1, min(config.tile_size or default, num_rays))
+    num_tiles = -(-num_rays // tile)
+    padding = ((0, num_tiles * tile - num_rays), (0, 0))
+
+    def tiles(x: Float[Array, "R 3"]) -> Float[Array, "tiles 3 lanes"]:
+        padded = jnp.pad(jax.lax.stop_gradient(x), padding, mode="edge") if num_rays else x
+        return padded.reshape(num_tiles, tile, 3).transpose(0, 2, 1)
+
+    codes, overflow = jax.lax.map(
+        lambda rays: _march_tile(tables, config, *rays), (tiles(rays.origins), tiles(rays.directions))
+    )
+    codes = codes.transpose(0, 2, 1).reshape(num_tiles * tile, config.max_tets_per_ray)
+    return Crossings(codes=codes[:num_rays], overflow=overflow.reshape(-1)[:num_rays])
+
+
+def _march_tile(
+    tables: MarchTables, config: MarchConfig, origins: Float[Array, "3 lanes"], directions: Float[Array, "3 lanes"]
+) -> tuple[Int[Array, "K lanes"], Bool[Array, " lanes"]]:
+    origin, axes = tuple(origins), ray_frame(tuple(directions))
+    across = axes[:2]
+    entry_holds, num_entries = _find_entries(tables, config, origin, axes)
+
+    lanes, slots = origins.shape[1], config.max_tets_per_ray
+
+    def held_points(hold: Int[Array, " lanes"]) -> Float[Array, "3 2 lanes"]:
+        """Projected corners of the face that is entered, from scratch (at the cage's boundary)."""
+        face = hold // 3
+        held = jnp.asarray(FACES, jnp.int32)[face & 3]  # boundary faces are held unrotated
+        points = [project(tuple(tables.corners[:, (face & ~3) + held[:, j]]), origin, across) for j in range(3)]
+        return jnp.stack([jnp.stack(point) for point in points])
+
+    def unfinished(state: tuple) -> Bool[Array, ""]:
+        return (state[0] < slots) & jnp.any(state[1] >= 0)
+
+    def step(state: tuple) -> tuple:
+        slot, hold, points, entry, codes = state
+        active = hold >= 0
+        new = jnp.stack(project(tuple(tables.corners[:, jnp.maximum(hold, 0) // 3]), origin, across))
+        left = [passes_left(tuple(new), tuple(points[j])) for j in range(3)]
+        # The way out is the new vertex's triangle around the ray: right of one held corner, left of the next.
+        # If rounding leaves none (a sliver seen edge-on), any other face than the entry advances.
+        exit_slot = jnp.where(~left[1] & left[2], 0, jnp.where(~left[2] & left[0], 1, 2))
+        code = jnp.where(active, 3 * hold + exit_slot, -1)
+        codes = jax.lax.dynamic_update_index_in_dim(codes, code, slot, 0)
+
+        first = jnp.where(exit_slot == 0, points[1], jnp.where(exit_slot == 1, points[2], points[0]))
+        second = jnp.where(exit_slot == 0, points[2], jnp.where(exit_slot == 1, points[0], points[1]))
+        points = jnp.stack([new, first, second])
+        hold = jnp.where(active, tables.next_holds[jnp.maximum(code, 0)], -1)
+        reenters = active & (hold < 0)
+        hold = jnp.where(reenters, _pick(entry_holds, entry), hold)
+        entry = entry + reenters.astype(jnp.int32)
+        reenters &= hold >= 0
+        points = jax.lax.cond(
+            jnp.any(reenters),
+            lambda: jnp.where(reenters, held_points(jnp.maximum(hold, 0)), points),
+            lambda: points,
+        )
+        return slot + 1, hold, points, entry, codes
+
+    start = (
+        jnp.zeros((), jnp.int32),
+        entry_holds[0],  # 3 * (4 tet + f) + r; -1 when the ray is done
+        held_points(jnp.maximum(entry_holds[0], 0)),
+        jnp.ones(lanes, jnp.int32),  # the next entry to take
+        jnp.full((slots, lanes), -1, jnp.int32),
+    )
+    _, hold, _, _, codes = jax.lax.while_loop(unfinished, step, start)
+    return codes, (hold >= 0) | (num_entries > config.max_entries_per_ray)
+
+
+def _find_entries(
+    tables: MarchTables, config: MarchConfig, origin: tuple, axes: tuple
+) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"]]:
+    """The front-facing boundary faces on each lane's line, sorted by t: their holds (-1 pads) and their count."""
+    lanes, slots = origin[0].shape[0], config.max_entries_per_ray
+    dtype = origin[0].dtype
+    clusters, width = tables.face_holds.shape
+    words = _pack_bits(_near_clusters(tables, origin, axes[2]))
+
+    def test_face(i: Int[Array, ""], state: tuple) -> tuple:
+        cluster, found = state
+        hold = tables.face_holds[cluster, i]
+        a, b, c = (project(tuple(corner), origin, axes) for corner in tables.face_corners[cluster, i])
+        # Counter-clockwise from outside is clockwise along a ray that comes from outside.
+        hit = (hold >= 0) & ~passes_left(a, b) & ~passes_left(b, c) & ~passes_left(c, a)
+        wa, wb, wc = face_weights(a, b, c)
+        t = jnp.where(hit, wa * a[2] + wb * b[2] + wc * c[2], jnp.inf)
+        return cluster, jax.lax.cond(jnp.any(hit), lambda: _insert(found, t, hold), lambda: found)
+
+    def test_next_cluster(state: tuple) -> tuple:
+        word, bits, found = state
+        lowest = jax.lax.population_count(~bits & (bits - 1)).astype(jnp.int32)
+        cluster = jnp.minimum(32 * word + lowest, clusters - 1)
+        found = jax.lax.cond(
+            bits != 0,
+            lambda: jax.lax.fori_loop(0, width, test_face, (cluster, found))[1],
+            lambda: found,
+        )
+        bits = bits & (bits - 1)
+        word = jnp.where(bits == 0, word + 1, word)
+        bits = jnp.where(bits == 0, words[jnp.minimum(word, len(words) - 1)], bits)
+        return word, bits, found
+
+    empty = (
+        jnp.full((slots, lanes), jnp.inf, dtype),
+        jnp.full((slots, lanes), -1, jnp.int32),
+        jnp.zeros(lanes, jnp.int32),
+    )
+    start = (jnp.zeros((), jnp.int32), words[0], empty)
+    _, _, (_, holds, count) = jax.lax.while_loop(lambda s: s[0] < len(words), test_next_cluster, start)
+    return holds, count
+
+
+def _near_clusters(tables: MarchTables, origin: tuple, direction: tuple) -> Bool[Array, " clusters"]:
+    """Clusters that some line of the tile may meet: their spheres against a double cone around all lines.
+
+    A line at angle alpha to the cone's axis, through a point within rho of its apex, is at most
+    rho + (|s| + rho) tan(alpha) from the axis at height s. A sphere adds its radius to both lengths.
+    """
+    apex = [jnp.mean(o) for o in origin]
+    mean = [jnp.mean(d) for d in direction]
+    length = jnp.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
+    axis = [m / jnp.maximum(length, 1e-6) for m in mean]
+    cosine = jnp.min(sum(d * a for d, a in zip(direction, axis, strict=True)))
+    tangent = jnp.sqrt(jnp.maximum(1 - cosine**2, 0)) / jnp.maximum(cosine, 1e-6)
+    rho = jnp.sqrt(jnp.max(sum((o - a) ** 2 for o, a in zip(origin, apex, strict=True))))
+
+    offset = [tables.cluster_centers[:, i] - apex[i] for i in range(3)]
+    height = sum(o * a for o, a in zip(offset, axis, strict=True))
+    squared = sum((o - height * a) ** 2 for o, a in zip(offset, axis, strict=True))
+    margin = 1e-4 * (jnp.abs(height) + tables.cluster_radii)  # rounding of cosine and height, generously
+    reach = tables.cluster_radii + rho
+    near = jnp.sqrt(squared) <= margin + reach + (jnp.abs(height) + reach) * (tangent + 1e-3)
+    return (near | (cosine < 0.1)) & (tables.cluster_radii >= 0)
+
+
+def _pack_bits(flags: Bool[Array, " n"]) -> Array:
+    """Flags as words of 32 bits, the first flag lowest."""
+    rows = jnp.pad(flags, (0, -len(flags) % 32)).reshape(-1, 32).astype(jnp.uint32)
+    return jnp.sum(rows << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
+
+
+def _insert(found: tuple, t: Float[Array, " lanes"], hold: Int[Array, ""]) -> tuple:
+    """Insert hits (t is inf elsewhere) into the lanes' lists, sorted by t; what falls off is only counted."""
+    ts, holds, count = found
+    count = count + (t < jnp.inf).astype(jnp.int32)
+    hold = jnp.full(t.shape, hold)
+    new_ts, new_holds = [], []
+    for old_t, old_hold in zip(ts, holds, strict=True):
+        before = t < old_t
+        new_ts.append(jnp.where(before, t, old_t))
+        new_holds.append(jnp.where(before, hold, old_hold))
+        t, hold = jnp.where(before, old_t, t), jnp.where(before, old_hold, hold)
+    return jnp.stack(new_ts), jnp.stack(new_holds), count
+
+
+def _pick(rows: Int[Array, "B lanes"], index: Int[Array, " lanes"]) -> Int[Array, " lanes"]:
+    """rows[index[lane], lane] by selection; -1 past the end."""
+    result = jnp.full_like(rows[0], -1)
+    for i in range(1, rows.shape[0]):
+        result = jnp.where(index == i, rows[i], result)
+    return result

@@ -1,0 +1,79 @@
+"""The pixels to train on: those of all views whose rays hit the cage, as one pool to draw batches from."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from nimpostor_jax.config import Background, MarchConfig
+from nimpostor_jax.render.camera import image_pixels, pixel_rays
+from nimpostor_jax.render.capacity import rays_hit
+from nimpostor_jax.render.traverse import march_tables
+from nimpostor_jax.train.step import RayBatch
+from nimpostor_jax.types import Camera, TetMesh
+
+
+@struct.dataclass
+class PixelPool:
+    """P pixels of N views."""
+
+    views: Int[Array, " P"]
+    pixels: Int[Array, "P 2"]  # x, y
+    colors: Float[Array, "P 4"]  # premultiplied
+    cameras: Camera  # batched over N
+
+
+def build_pool(
+    mesh: TetMesh, cameras: Camera, images: Float[np.ndarray, "N H W 4"], march: MarchConfig
+) -> tuple[PixelPool, float]:
+    """Pixels whose rays hit the cage, and the share of foreground pixels (alpha > 0.5) that do not.
+
+    Raises ValueError where no pixel hits the cage.
+    """
+    tables = jax.jit(march_tables)(mesh)
+    grid = image_pixels(cameras.height, cameras.width).reshape(-1, 2)
+    cast = jax.jit(lambda camera: pixel_rays(camera, grid))
+    views, indices, missed, foreground = [], [], 0, 0
+    for view in range(len(images)):
+        rays = cast(jax.tree.map(lambda x: x[view], cameras))
+        hits = np.asarray(rays_hit(mesh, tables, rays, march))
+        solid = images[view, ..., 3].reshape(-1) > 0.5
+        missed += int(np.sum(solid & ~hits))
+        foreground += int(np.sum(solid))
+        indices.append(np.flatnonzero(hits))
+        views.append(np.full(len(indices[-1]), view))
+    if not sum(map(len, indices)):
+        raise ValueError(f"no pixel of {len(images)} views hits the cage; is it in the cameras' world coordinates?")
+    view_ids, pixel_ids = np.concatenate(views), np.concatenate(indices)
+    flat = images.reshape(len(images), -1, 4)
+    pool = PixelPool(
+        views=jnp.asarray(view_ids, jnp.int32),
+        pixels=jnp.asarray(np.stack([pixel_ids % cameras.width, pixel_ids // cameras.width], axis=1), jnp.int32),
+        colors=jnp.asarray(flat[view_ids, pixel_ids]),
+        cameras=cameras,
+    )
+    return pool, missed / max(foreground, 1)
+
+
+@partial(jax.jit, static_argnames=("size", "background"))
+def draw_batch(
+    key: Array, step: Int[Array, ""] | int, pool: PixelPool, size: int, background: Background
+) -> RayBatch:
+    """A batch of pixels drawn uniformly with replacement; a function of key and step alone."""
+    choice_key, background_key, jitter_key = jax.random.split(jax.random.fold_in(key, step), 3)
+    chosen = jax.random.randint(choice_key, (size,), 0, pool.views.shape[0])
+    cameras = jax.tree.map(lambda x: x[pool.views[chosen]], pool.cameras)
+    rays = pixel_rays(cameras, pool.pixels[chosen] + 0.5)
+    if background == "random":
+        colors = jax.random.uniform(background_key, (size, 3))
+    else:
+        colors = jnp.full((size, 3), 1.0 if background == "white" else 0.0)
+    return RayBatch(
+        rays=rays,
+        target=pool.colors[chosen],
+        background=colors,
+        jitter=jax.random.uniform(jitter_key, (size,)),
+    )

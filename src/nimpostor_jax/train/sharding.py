@@ -1,0 +1,49 @@
+"""Data parallelism around the pure step: rays are split over devices, everything else is replicated."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.train.step import Metrics, Parameters, RayBatch, loss_gradient
+from nimpostor_jax.types import NeuralImpostor
+
+AXIS = "rays"
+
+
+def device_mesh(devices: list | None = None) -> Mesh:
+    """A one-dimensional mesh over all (or the given) devices."""
+    devices = devices or jax.local_devices()
+    return jax.make_mesh((len(devices),), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
+
+
+def data_parallel(mesh: Mesh) -> Callable[..., tuple[Parameters, Metrics]]:
+    """`loss_gradient` with the batch's rays split over the mesh; gradients and metrics are averaged.
+
+    Marching and packing then stay within a device: their loops and buffers know nothing of the others.
+    The number of rays must be a multiple of the number of devices.
+    """
+
+    def gradient(
+        parameters: Parameters, impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig
+    ) -> tuple[Parameters, Metrics]:
+        @partial(jax.shard_map, mesh=mesh, in_specs=(P(), P(), P(AXIS)), out_specs=P(), check_vma=False)
+        def shard(parameters: Parameters, impostor: NeuralImpostor, batch: RayBatch) -> tuple[Parameters, Metrics]:
+            return jax.lax.pmean(loss_gradient(parameters, impostor, batch, config), AXIS)
+
+        return shard(parameters, impostor, batch)
+
+    return gradient
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """Sharding of state and impostor."""
+    return NamedSharding(mesh, P())
+
+
+def over_rays(mesh: Mesh) -> NamedSharding:
+    """Sharding of batches."""
+    return NamedSharding(mesh, P(AXIS))
