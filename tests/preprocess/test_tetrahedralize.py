@@ -43,6 +43,25 @@ def test_target_count_is_met(target):
     assert not outside_points(np.asarray(ball.vertices), vertices, tets).any()
 
 
+def test_a_crash_of_ftetwild_is_an_attempt_without_result(monkeypatch, tmp_path):
+    surface = trimesh.creation.icosphere(subdivisions=2)
+    program = tmp_path / "program.py"
+    monkeypatch.setattr(module, "_PROGRAM", program)
+    program.write_text("import os; os.abort()")
+    vertices, tets = run_ftetwild(surface, epsilon=0.05)
+    assert vertices.shape == (0, 3) and tets.shape == (0, 4)
+    program.write_text("import no_such_module_anywhere")
+    with pytest.raises(RuntimeError, match="no_such_module_anywhere"):
+        run_ftetwild(surface, epsilon=0.05)
+
+
+def test_the_search_stops_at_the_largest_tolerance(monkeypatch):
+    calls = fake_counts(monkeypatch, lambda eps: 90)
+    with pytest.raises(ValueError, match=r"no cage with about 30 tets: .* has 90; ask for about"):
+        tetrahedralize(ball_envelope, 30, DIAGONAL, 0.02, lambda _: None)
+    assert len(calls) == 1
+
+
 def fake_counts(monkeypatch, count_of_epsilon):
     """Replace fTetWild by rows of boxes whose number follows from the tolerance."""
     calls = []
@@ -65,7 +84,7 @@ def test_search_copes_with_a_noisy_count(monkeypatch):
     calls = fake_counts(
         monkeypatch, lambda eps: 350 * (0.02 / eps) ** 0.9 * noise.uniform(0.85, 1.15)
     )
-    for target in (60, 350, 1500):
+    for target in (150, 350, 1500):
         calls.clear()
         _, tets = tetrahedralize(ball_envelope, target, DIAGONAL, 0.02, lambda _: None)
         assert abs(len(tets) / target - 1) <= 0.2

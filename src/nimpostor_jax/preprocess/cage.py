@@ -33,15 +33,24 @@ class PosedImages(Protocol):
     """What `cage_from_images` reads of `io.blender.PosedImages`."""
 
     @property
-    def images(self) -> Float[np.ndarray, "N H W 4"]: ...
+    def images(self) -> Float[np.ndarray, "N H W 4"]:
+        """Premultiplied RGBA in [0, 1]."""
+
     @property
-    def camera_to_world(self) -> Float[np.ndarray, "N 4 4"]: ...
+    def camera_to_world(self) -> Float[np.ndarray, "N 4 4"]:
+        """Rigid transforms, OpenGL axes."""
+
     @property
-    def focal(self) -> Float[np.ndarray, "N 2"]: ...
+    def focal(self) -> Float[np.ndarray, "N 2"]:
+        """In pixels."""
+
     @property
-    def principal(self) -> Float[np.ndarray, "N 2"]: ...
+    def principal(self) -> Float[np.ndarray, "N 2"]:
+        """In pixels."""
+
     @property
-    def names(self) -> tuple[str, ...]: ...
+    def names(self) -> tuple[str, ...]:
+        """Of the images, for messages."""
 
 
 Cage = tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 4"]]

@@ -13,10 +13,13 @@ in a random order that cannot be seeded: equal input gives other tets, and count
 
 import dataclasses
 import math
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
-import pytetwild
 import trimesh
 from jaxtyping import Float, Int
 
@@ -28,10 +31,12 @@ MAX_CALLS = 9
 _CLOSE_ENOUGH = 0.08  # the search stops here
 _TOLERATED = 0.2  # a result within this share of the target is what was asked for
 _HOPELESS = 0.5
-_EPSILON_RANGE = (0.0015, 0.12)
+_EPSILON_RANGE = (0.0015, 0.08)
 _CLEARANCE = 1.15  # offset of the envelope over epsilon
 _SLOPE = 1.25  # the count goes about as epsilon**-slope
 _STEP = 0.8  # triangle size of the envelope over its offset
+# A process of its own: fTetWild can abort the one that it runs in.
+_PROGRAM = Path(__file__).with_name("ftetwild_process.py")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +72,7 @@ def tetrahedralize(
     Raises:
         ValueError: no attempt comes within 50% of the target.
     """
-    # fTetWild cannot go below a few dozen tets, and need not: a box is as good.
+    # fTetWild cannot go below 50 to 90 tets; for a handful of them a box is as good.
     if target_tets <= 12:
         return box_tets(envelope(margin * diagonal, margin * diagonal).bounds)
     attempts: list[_Attempt] = []
@@ -83,7 +88,9 @@ def tetrahedralize(
             attempts.append(_Attempt(epsilon, vertices, tets))
             if attempts[-1].error(target_tets) <= _CLOSE_ENOUGH:
                 break
-        epsilon = _next_epsilon(attempts, target_tets, epsilon)
+        tried, epsilon = epsilon, _next_epsilon(attempts, target_tets, epsilon)
+        if (tried == _EPSILON_RANGE[0] > epsilon) or (tried == _EPSILON_RANGE[1] < epsilon):
+            break
     if not attempts:
         raise ValueError(
             f"fTetWild returned no usable mesh in {MAX_CALLS} calls; enlarge CageConfig.margin"
@@ -103,23 +110,31 @@ def tetrahedralize(
 def run_ftetwild(
     surface: trimesh.Trimesh, epsilon: float, edge_length_factor: float = 0.2
 ) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 4"]]:
-    """One call of fTetWild: positively oriented tets without unused vertices.
+    """One call of fTetWild: positively oriented tets without unused vertices; none if it crashes.
 
     `epsilon` is the tolerance of the surface in world units; `edge_length_factor` the ideal edge
     over the diagonal of the surface's box.
     """
-    diagonal = float(np.linalg.norm(surface.extents))
-    vertices, tets = pytetwild.tetrahedralize(
-        np.asarray(surface.vertices, np.float64),
-        np.asarray(surface.faces, np.int32),
-        edge_length_fac=edge_length_factor,
-        epsilon=epsilon / diagonal,
-        coarsen=True,
-        num_threads=1,
-        quiet=True,
-    )
-    used, compact = np.unique(np.asarray(tets), return_inverse=True)
-    vertices = np.asarray(vertices, np.float64)[used]
+    with tempfile.TemporaryDirectory() as folder:
+        given, result = Path(folder, "surface.npz"), Path(folder, "tets.npz")
+        np.savez(
+            given,
+            vertices=np.asarray(surface.vertices, np.float64),
+            faces=np.asarray(surface.faces, np.int32),
+            edge=edge_length_factor,
+            epsilon=epsilon / float(np.linalg.norm(surface.extents)),
+        )
+        # -P: this folder's modules must not shadow installed ones.
+        command = [sys.executable, "-P", str(_PROGRAM), str(given), str(result)]
+        child = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        if child.returncode > 0:  # a Python error; a crash of fTetWild ends by a signal
+            raise RuntimeError(f"pytetwild failed: {child.stderr.strip()[-500:]}")
+        if child.returncode < 0 or not result.is_file():
+            return np.zeros((0, 3)), np.zeros((0, 4), np.int32)
+        with np.load(result) as data:
+            vertices, tets = data["vertices"], data["tets"]
+    used, compact = np.unique(tets, return_inverse=True)
+    vertices = vertices[used]
     return vertices, orient_tets(
         compact.reshape(-1, 4).astype(np.int32), vertices
     )  # pytetwild 0.4 returns them inverted
