@@ -1,7 +1,7 @@
 """fTetWild in a process of its own: `python ftetwild_process.py surface.npz tets.npz`.
 
-fTetWild can abort the whole process (seen at large tolerances), which no `except` catches. This file
-is run by its path, so that neither JAX nor this package is imported.
+fTetWild can abort the whole process (seen at large tolerances), which no `except` catches. This
+file is run by its path, so that neither JAX nor this package is imported.
 """
 
 import sys
