@@ -62,7 +62,8 @@ def fit_capacities(
     boundaries = step_boundaries(config.sampler)
     wanted = np.clip(np.searchsorted(boundaries, np.asarray(total) * (1 - 1e-5)), 0, len(boundaries) - 1)
     most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
-    mean = min(most, int(np.ceil(margin * wanted.mean())) + 1)
+    # Rays share the buffer, so that its mean load fluctuates much less than a single ray's.
+    mean = min(most, int(np.ceil((1 + (margin - 1) / 2) * wanted.mean())))
     march = dataclasses.replace(config.march, max_tets_per_ray=_round_up(margin * int(most_tets)))
     sampler = dataclasses.replace(config.sampler, max_samples_per_ray=most, capacity_per_ray=mean)
     return dataclasses.replace(config, march=march, sampler=sampler)

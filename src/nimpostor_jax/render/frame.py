@@ -108,7 +108,7 @@ def _padded(chosen: np.ndarray, size: int) -> np.ndarray:
 
 def _grow(config: RenderConfig) -> RenderConfig:
     sampler = dataclasses.replace(config.sampler, capacity_per_ray=None)
-    return dataclasses.replace(grow_march(config), sampler=sampler)
+    return dataclasses.replace(grow_march(config), sampler=sampler, visible_per_ray=None)
 
 
 def to_image(output: RenderOutput, background: Float[np.ndarray, " 3"] | float = 1.0) -> Float[np.ndarray, "H W 3"]:

@@ -8,7 +8,7 @@ from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sample_weights
-from nimpostor_jax.render.sampling import Samples, sample_segments, to_grid
+from nimpostor_jax.render.sampling import Samples, from_grid, sample_segments, select_samples, to_grid
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import MarchTables, march_tables, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, RenderOutput
@@ -41,6 +41,8 @@ def _integrate(
     impostor: NeuralImpostor, rays: Rays, samples: Samples, overflow: Array, config: RenderConfig
 ) -> RenderOutput:
     max_samples = config.sampler.max_samples_per_ray
+    if config.visible_per_ray is not None:
+        samples = _visible(impostor, samples, config)
     point_features = field.features(impostor, samples.tet_ids, samples.lambdas)
     sigmas = field.density(impostor, samples.tet_ids, point_features)
     directions = field.encode_directions(impostor, rays.directions)[samples.rays]
@@ -61,3 +63,18 @@ def _integrate(
         coarsened=samples.coarsened,
     )
 
+
+def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig) -> Samples:
+    """The samples that contribute at least `min_weight`, found by a pass over densities without gradient.
+
+    Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
+    """
+    frozen, seen = jax.lax.stop_gradient((impostor, samples))
+    point_features = field.features(frozen, seen.tet_ids, seen.lambdas)
+    sigmas = field.density(frozen, seen.tet_ids, point_features)
+    max_samples = config.sampler.max_samples_per_ray
+    weights = sample_weights(to_grid(sigmas, seen, max_samples), to_grid(seen.deltas, seen, max_samples))
+    keep = from_grid(weights, seen) >= config.min_weight
+    num_rays = samples.counts.shape[0]
+    capacity = min(num_rays * (config.visible_per_ray or max_samples), samples.t.shape[0])
+    return select_samples(samples, keep, capacity)

@@ -126,12 +126,44 @@ def _find_segment(
     return jnp.minimum(low, num_slots - 1)
 
 
+def select_samples(samples: Samples, keep: Bool[Array, " M"], capacity: int) -> Samples:
+    """Only the samples to keep, packed into `capacity` slots in the same order.
+
+    `overflow` marks rays some of whose samples did not fit, besides those that had it already.
+    """
+    num_rays = samples.counts.shape[0]
+    keep &= samples.deltas > 0
+    wanted = jnp.zeros(num_rays, jnp.int32).at[samples.rays].add(keep.astype(jnp.int32))
+    firsts = jnp.cumsum(wanted) - wanted
+    counts = jnp.clip(capacity - firsts, 0, wanted)
+    chosen = jnp.nonzero(keep, size=capacity, fill_value=0)[0]
+    used = jnp.arange(capacity) < jnp.sum(wanted)
+    rays = samples.rays[chosen]
+    return Samples(
+        tet_ids=samples.tet_ids[chosen],
+        lambdas=samples.lambdas[chosen],
+        t=samples.t[chosen],
+        deltas=jnp.where(used, samples.deltas[chosen], 0),
+        rays=rays,
+        slots=jnp.where(used, jnp.arange(capacity, dtype=jnp.int32) - firsts[rays], 0),
+        starts=jnp.minimum(firsts, capacity - 1),
+        counts=counts,
+        overflow=samples.overflow | (counts < wanted),
+        coarsened=samples.coarsened,
+    )
+
+
 def to_grid(values: Float[Array, "M *rest"], samples: Samples, max_samples: int) -> Float[Array, "R S *rest"]:
     """Packed values as [R, S]; zero where a ray has no sample. Linear; its transpose is `from_grid`."""
     slots = jnp.arange(max_samples, dtype=jnp.int32)
     used = slots < samples.counts[:, None]
     index = jnp.where(used, samples.starts[:, None] + slots, 0)
     return _to_grid(values, index, used, samples.rays * max_samples + samples.slots, samples.deltas > 0)
+
+
+def from_grid(values: Float[Array, "R S"], samples: Samples) -> Float[Array, " M"]:
+    """Values on [R, S] in packed order; zero in unused slots."""
+    return jnp.where(samples.deltas > 0, values[samples.rays, samples.slots], 0)
 
 
 @jax.custom_vjp

@@ -4,6 +4,7 @@ Axes: R rays, K tet slots. Barycentric coordinates of the entry and exit points 
 that the ray passes, never from the tet's volume, so that slivers cost no precision.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -30,10 +31,11 @@ def locate_segments(
     axes = ray_frame(tuple(rays.directions[:, None, i] for i in range(3)))
     points = []
     for i in range(4):
-        corner = mesh.vertices[mesh.tets[:, i][tet_ids]]
-        points.append(project(tuple(corner[..., j] for j in range(3)), origin, axes))
+        corner = [mesh.vertices[:, axis][mesh.tets[:, i]][tet_ids] for axis in range(3)]  # a gather a column
+        points.append(project(tuple(corner), origin, axes))
+    points = _materialize(points)
     per_face = [_face_coordinates(points, face) for face in FACES]
-    lambda_enter, lambda_exit = _select(per_face, entry_faces), _select(per_face, exit_faces)
+    lambda_enter, lambda_exit = _materialize((_select(per_face, entry_faces), _select(per_face, exit_faces)))
     t_enter = sum(weight * point[2] for weight, point in zip(lambda_enter, points, strict=True))
     t_exit = sum(weight * point[2] for weight, point in zip(lambda_exit, points, strict=True))
 
@@ -49,6 +51,11 @@ def locate_segments(
         lambda_exit=jnp.where(used[..., None], jnp.stack(lambda_exit, axis=-1), 0),
         overflow=crossings.overflow,
     )
+
+
+# XLA's CPU back end copies a fused computation into each of its consumers: without these cuts, every
+# output recomputes all four faces, for seven times the arithmetic.
+_materialize = jax.lax.optimization_barrier
 
 
 def _face_coordinates(points: list, face: tuple[int, int, int]) -> list[Float[Array, "R K"]]:

@@ -1,0 +1,51 @@
+"""Train a Neural Impostor from posed images (nerf-synthetic format) and evaluate it on held-out views.
+
+    python experiments/train.py --gin_configs=experiments/configs/mic.gin --data=DIR --workdir=out/mic
+
+Writes to the workdir: cage.npz, config.gin, checkpoints/, log.csv, impostor.npz, metrics.json, pictures/*.png.
+A run that was cut off continues from its last checkpoint when it is started again.
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from nimpostor_jax.gin_flags import add_flags, config_from_args, operative_config_text, run_cli
+from nimpostor_jax.io.atomic import atomic_path
+from nimpostor_jax.io.impostor_file import save_impostor
+from nimpostor_jax.pipeline.evaluate import evaluate, write_json
+from nimpostor_jax.pipeline.fit import fit
+from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", required=True, help="a nerf-synthetic folder, or a built-in scene: fluffy_ball")
+    parser.add_argument("--workdir", required=True, type=Path, help="where everything is written")
+    parser.add_argument("--cage", type=Path, help="a cage (.npz, .vtk, .vtu, .msh); without it, one is built")
+    parser.add_argument("--max_minutes", type=float, help="fit the schedule to a time budget instead of steps")
+    add_flags(parser)
+    args = parser.parse_args(argv)
+    if args.max_minutes is not None and not args.max_minutes > 0:
+        raise ValueError(f"--max_minutes must be > 0, got {args.max_minutes}")
+    config = config_from_args(args)
+
+    use_all_cores()
+    own_cage = args.workdir / "cage.npz"
+    cage = args.cage or (own_cage if own_cage.exists() else None)
+    scene = prepare(config, args.data, cage=cage, cage_output=own_cage)
+    with atomic_path(args.workdir / "config.gin") as path:
+        path.write_text(operative_config_text(config), encoding="utf-8")
+    impostor, progress = fit(scene, workdir=args.workdir, max_minutes=args.max_minutes)
+    print(f"trained {progress.step} steps in {progress.seconds / 60:.1f} minutes")
+    save_impostor(args.workdir / "impostor.npz", impostor)
+    result = evaluate(
+        impostor, scene.test, config.render, background=config.data.background, pictures=args.workdir / "pictures"
+    )
+    result |= {"steps": progress.step, "train_seconds": progress.seconds}
+    write_json(args.workdir / "metrics.json", result)
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,1 @@
+"""The main job, from posed images to a trained impostor and its figures: what scripts and notebooks call."""

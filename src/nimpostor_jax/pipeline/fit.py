@@ -1,0 +1,206 @@
+"""The training run: batches, steps, progress, logs and checkpoints.
+
+A run that is killed and started again continues from its last checkpoint and ends with the same parameters:
+batches are functions of seed and step, and the learning rate of step and schedule.
+"""
+
+import csv
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm.auto import tqdm
+
+from nimpostor_jax.config import RenderConfig, TrainConfig
+from nimpostor_jax.io.checkpoint import (
+    cage_fingerprint,
+    latest_step,
+    load_metadata,
+    restore_checkpoint,
+    save_checkpoint,
+)
+from nimpostor_jax.pipeline.prepare import Log, Scene
+from nimpostor_jax.render.capacity import grow_march
+from nimpostor_jax.train.pool import draw_batch
+from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.step import (
+    TrainState,
+    init_state,
+    learning_rate,
+    loss_gradient,
+    make_optimizer,
+    train_step,
+    with_parameters,
+)
+from nimpostor_jax.types import NeuralImpostor
+
+LOG_FIELDS = ("step", "seconds", "loss", "psnr", "rays_per_second", "learning_rate", "overflow", "coarsened")
+MAX_OVERFLOW = 0.5  # share of a batch's rays that may be dropped before the buffers grow
+
+
+@dataclasses.dataclass
+class Progress:
+    """How far a run is: what a schedule needs, and what a checkpoint keeps beside the state."""
+
+    step: int = 0
+    seconds: float = 0.0  # of training, without compilation and evaluation
+
+    def share(self, config: TrainConfig, max_minutes: float | None) -> float:
+        """Position in the schedule, 1 at its end: by steps, or by time where minutes are given."""
+        if max_minutes is not None:
+            return self.seconds / (60 * max_minutes)
+        return self.step / config.steps
+
+
+def fit(
+    scene: Scene,
+    *,
+    workdir: str | Path | None = None,
+    max_minutes: float | None = None,
+    callback: Callable[[NeuralImpostor, int], None] | None = None,
+    log: Log = print,
+) -> tuple[NeuralImpostor, Progress]:
+    """Train a prepared scene's impostor; returns it trained, and how long that took.
+
+    With a `workdir`, writes `log.csv` and checkpoints there and resumes from them. `max_minutes` replaces
+    `TrainConfig.steps`: the schedule then follows the clock. `callback(impostor, step)` runs every
+    `TrainConfig.eval_every` steps. Raises FloatingPointError where the loss is not finite.
+    """
+    config = scene.config.train
+    devices = _usable_devices(config)
+    optimizer = make_optimizer()
+    state, progress = init_state(scene.impostor, optimizer), Progress()
+    checkpoints = Path(workdir) / "checkpoints" if workdir is not None else None
+    identity = {"cage": cage_fingerprint(scene.impostor.mesh)}
+    if checkpoints is not None and latest_step(checkpoints) is not None:
+        state, step = restore_checkpoint(checkpoints, state, scene.config, metadata=identity)
+        progress = Progress(step=step, seconds=load_metadata(checkpoints, step)["seconds"])
+        log(f"resuming {checkpoints} at step {step}")
+
+    impostor, pool, gradient, place = scene.impostor, scene.pool, loss_gradient, (lambda batch: batch)
+    if len(devices) > 1:
+        mesh = device_mesh(devices)
+        state, impostor, pool = jax.device_put((state, impostor, pool), replicated(mesh))
+        gradient = data_parallel(mesh)
+        place = partial(jax.device_put, device=over_rays(mesh))
+    render = scene.render
+    step_function = partial(train_step, optimizer=optimizer, gradient=gradient)
+    compiled = jax.jit(step_function, static_argnames="config", donate_argnums=0)
+    key = jax.random.key(config.seed + 1)
+    records = _LogFile(Path(workdir) / "log.csv" if workdir is not None else None, progress.step)
+    bar = tqdm(total=None if max_minutes else config.steps, initial=progress.step, unit="step", disable=None)
+
+    def save() -> None:
+        if checkpoints is not None and latest_step(checkpoints) != progress.step:
+            metadata = {**identity, "seconds": progress.seconds}
+            save_checkpoint(checkpoints, progress.step, state, scene.config, metadata=metadata)
+
+    clock = None  # starts after the first step of this process, which compiles
+    try:
+        while (share := progress.share(config, max_minutes)) < 1:
+            batch = place(draw_batch(key, progress.step, pool, config.rays_per_batch, config.background))
+            rate = learning_rate(config, share, progress.step)
+            state, metrics = compiled(state, impostor, batch, jnp.asarray(rate, jnp.float32), config=render)
+            progress.step += 1
+            bar.update()
+            if clock is None or progress.step % _SYNC_EVERY == 0:
+                jax.block_until_ready(metrics)
+            now = time.perf_counter()
+            progress.seconds += now - clock if clock is not None else 0.0
+            if progress.step % config.log_every == 0 or clock is None:
+                record = records.write(progress, metrics, rate, config.rays_per_batch)
+                bar.set_postfix({k: f"{record[k]:.4g}" for k in ("loss", "psnr", "rays_per_second")})
+                if record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps:
+                    render = _grow(render)
+                    log(f"step {progress.step}: {record['overflow']:.0%} of the rays overflowed; larger buffers")
+            clock = time.perf_counter()
+            if progress.step % config.checkpoint_every == 0:
+                save()
+                clock = time.perf_counter()
+            if callback is not None and config.eval_every and progress.step % config.eval_every == 0:
+                callback(_trained(scene.impostor, state, devices), progress.step)
+                clock = time.perf_counter()
+        save()
+    finally:
+        bar.close()
+        records.close()
+    return _trained(scene.impostor, state, devices), progress
+
+
+_SYNC_EVERY = 8  # steps that may be under way at once
+
+
+def _usable_devices(config: TrainConfig) -> Sequence[jax.Device]:
+    devices = jax.local_devices()
+    return devices if config.rays_per_batch % len(devices) == 0 else devices[:1]
+
+
+def _trained(impostor: NeuralImpostor, state: TrainState, devices: Sequence[jax.Device]) -> NeuralImpostor:
+    return with_parameters(impostor, jax.device_put(state.parameters, devices[0]))
+
+
+def _grow(config: RenderConfig) -> RenderConfig:
+    """Twice the slots of every buffer."""
+    sampler = config.sampler
+    most = sampler.max_samples_per_ray
+    capacity = min(most, 2 * (sampler.capacity_per_ray or most))
+    return dataclasses.replace(
+        grow_march(config),
+        sampler=dataclasses.replace(sampler, capacity_per_ray=capacity),
+        visible_per_ray=None if config.visible_per_ray is None else min(most, 2 * config.visible_per_ray),
+    )
+
+
+class _LogFile:
+    """`log.csv`, one line every `log_every` steps; a resumed run drops lines beyond its checkpoint."""
+
+    def __init__(self, path: Path | None, step: int):
+        self._file = None
+        self._last = (step, time.perf_counter())
+        if path is None:
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        kept = []
+        if path.exists() and step > 0:
+            with path.open(newline="") as file:
+                kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+        self._file = path.open("w", newline="")
+        self._writer = csv.DictWriter(self._file, LOG_FIELDS)
+        self._writer.writeheader()
+        self._writer.writerows(kept)
+
+    def write(self, progress: Progress, metrics: dict, rate: float, rays: int) -> dict[str, float]:
+        """Record a step; waits for its metrics."""
+        values = {name: float(np.asarray(value)) for name, value in metrics.items()}
+        if not math.isfinite(values["loss"]):
+            raise FloatingPointError(
+                f"the loss is {values['loss']} at step {progress.step}; lower TrainConfig.learning_rate"
+            )
+        now = time.perf_counter()
+        steps, seconds = progress.step - self._last[0], now - self._last[1]
+        self._last = (progress.step, now)
+        record = {
+            "step": progress.step,
+            "seconds": round(progress.seconds, 3),
+            "loss": values["loss"],
+            "psnr": -10 * math.log10(max(values["loss"], 1e-12)),
+            "rays_per_second": rays * steps / max(seconds, 1e-9),
+            "learning_rate": rate,
+            "overflow": values["overflow"],
+            "coarsened": values["coarsened"],
+        }
+        if self._file is not None:
+            self._writer.writerow(record)
+            self._file.flush()
+        return record
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            self._file.close()

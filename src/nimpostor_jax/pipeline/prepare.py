@@ -1,0 +1,101 @@
+"""From a scene on disk to something trainable: views, cage, pool of pixels, buffers of the right size."""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import jax
+
+from nimpostor_jax.config import ExperimentConfig, RenderConfig
+from nimpostor_jax.field.impostor import init_impostor
+from nimpostor_jax.io.blender import PosedImages, check_masks, load_scene
+from nimpostor_jax.io.mesh_files import load_tets, save_tets
+from nimpostor_jax.io.scenes import resolve_scene
+from nimpostor_jax.preprocess.cage import Cage, cage_from_images
+from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.preprocess.validate import check_coverage, check_tets, missed_foreground, quality_report
+from nimpostor_jax.render.capacity import fit_capacities
+from nimpostor_jax.render.traverse import march_tables
+from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
+from nimpostor_jax.types import NeuralImpostor
+
+Log = Callable[[str], None]
+
+
+def use_all_cores() -> None:
+    """Give XLA's CPU back end one device a core, over which training and frames are spread.
+
+    Loops, gathers and scatters of one device run on one core. Call before any other use of jax; without
+    effect on accelerators or where the number of devices has been chosen already.
+    """
+    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """A prepared scene: what training starts from."""
+
+    config: ExperimentConfig
+    train: PosedImages
+    test: PosedImages
+    impostor: NeuralImpostor  # untrained
+    pool: PixelPool
+    render: RenderConfig  # with buffers that fit the training rays
+
+
+def prepare(
+    config: ExperimentConfig,
+    data: str | Path,
+    *,
+    cage: str | Path | None = None,
+    cage_output: str | Path | None = None,
+    log: Log = print,
+) -> Scene:
+    """Read a scene (a folder or a built-in name), read or build its cage, initialise the impostor.
+
+    A cage that is built is saved as `cage_output`. All input is checked before anything long starts.
+
+    Raises:
+        FileNotFoundError, ValueError: missing or inconsistent data, empty masks, a bad cage, or a cage that
+            more than `CageConfig.max_missed_share` of the foreground's rays miss.
+    """
+    train, test = load_scene(resolve_scene(data), config.data)
+    log(f"{data}: {len(train)} training views, {len(test)} test views, {train.width} x {train.height}")
+    vertices, tets = load_cage(config, train, cage, cage_output, log)
+    mesh = build_tet_mesh(vertices, tets)
+    pool, missed = build_pool(mesh, train.cameras, train.images, config.render.march)
+    log(f"{len(pool.views):,} training rays hit the cage; {missed:.4%} of opaque pixels do not")
+    key = jax.random.key(config.train.seed)
+    impostor = init_impostor(key, mesh, config.impostor)
+    entries = [f.shape[0] for f in impostor.tables.features]
+    log(f"{len(tets)} tets, {sum(entries):,} table entries in {len(entries)} levels {entries}")
+    probe = draw_batch(key, 0, pool, min(config.train.rays_per_batch, 8192), "white")
+    render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, config.render)
+    return Scene(config=config, train=train, test=test, impostor=impostor, pool=pool, render=render)
+
+
+def load_cage(
+    config: ExperimentConfig,
+    train: PosedImages,
+    cage: str | Path | None,
+    cage_output: str | Path | None,
+    log: Log,
+) -> Cage:
+    """The given cage file, checked against the views' foreground; or one built from the views' masks."""
+    if cage is None:
+        check_masks(train)
+        vertices, tets = cage_from_images(train, config.cage, log)
+        if cage_output is not None:
+            save_tets(cage_output, vertices, tets)
+            log(f"cage saved as {cage_output}")
+        return vertices, tets
+    vertices, tets = load_tets(cage)
+    check_tets(vertices, tets, str(cage))
+    if train.has_alpha.all():
+        views = (train.camera_to_world, train.focal, train.principal)
+        missed = missed_foreground(vertices, tets, train.masks, *views)
+        log(f"{cage}: {quality_report(vertices, tets)}; {missed}")
+        check_coverage(missed, config.cage.max_missed_share, train.names, str(cage))
+    return vertices, tets
