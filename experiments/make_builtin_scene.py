@@ -23,9 +23,7 @@ def write_split(source: Path, target: Path, split: str, resolution: int) -> int:
     posed = load_blender(source, split, resolution)
     centered = np.allclose(posed.principal, [0.5 * posed.width, 0.5 * posed.height])
     if not centered or not np.allclose(posed.focal, posed.focal[0, 0], rtol=1e-4):
-        raise ValueError(
-            f"{source}: 'camera_angle_x' alone cannot state the intrinsics of split {split!r}"
-        )
+        raise ValueError(f"{source}: 'camera_angle_x' alone cannot state the intrinsics of split {split!r}")
     frames = []
     for i, image in enumerate(posed.images):
         # The colour is divided by the alpha that is stored, so that their product is the average.
@@ -41,16 +39,10 @@ def write_split(source: Path, target: Path, split: str, resolution: int) -> int:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
-    parser.add_argument(
-        "scene", type=Path, help="folder with transforms_train.json and transforms_test.json"
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("scene", type=Path, help="folder with transforms_train.json and transforms_test.json")
     parser.add_argument("out", type=Path, help="folder to make; must not exist")
-    parser.add_argument(
-        "--resolution", type=int, default=100, help="width in pixels (default: 100)"
-    )
+    parser.add_argument("--resolution", type=int, default=100, help="width in pixels (default: 100)")
     args = parser.parse_args()
     if args.out.exists():
         parser.error(f"{args.out} exists; remove it first")

@@ -2,8 +2,8 @@
 
     python experiments/train.py --gin_configs=experiments/configs/mic.gin --data=DIR --workdir=out/mic
 
-Writes to the workdir: cage.npz, config.gin, checkpoints/, log.csv, impostor.npz, metrics.json, pictures/*.png.
-A run that was cut off continues from its last checkpoint when it is started again.
+Writes cage.npz, config.gin, checkpoints/, log.csv, impostor.npz, metrics.json and pictures/*.png to the
+workdir. A run that was cut off continues from its last checkpoint when it is started again.
 """
 
 import argparse
@@ -21,10 +21,14 @@ from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
 def main(argv: Sequence[str]) -> None:
     """Run the script."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", required=True, help="a nerf-synthetic folder, or a built-in scene: fluffy_ball")
+    parser.add_argument(
+        "--data", required=True, help="a nerf-synthetic folder, or a built-in scene: fluffy_ball"
+    )
     parser.add_argument("--workdir", required=True, type=Path, help="where everything is written")
     parser.add_argument("--cage", type=Path, help="a cage (.npz, .vtk, .vtu, .msh); without it, one is built")
-    parser.add_argument("--max_minutes", type=float, help="fit the schedule to a time budget instead of steps")
+    parser.add_argument(
+        "--max_minutes", type=float, help="fit the schedule to a time budget instead of steps"
+    )
     add_flags(parser)
     args = parser.parse_args(argv)
     if args.max_minutes is not None and not args.max_minutes > 0:
@@ -41,7 +45,11 @@ def main(argv: Sequence[str]) -> None:
     print(f"trained {progress.step} steps in {progress.seconds / 60:.1f} minutes")
     save_impostor(args.workdir / "impostor.npz", impostor)
     result = evaluate(
-        impostor, scene.test, config.render, background=config.data.background, pictures=args.workdir / "pictures"
+        impostor,
+        scene.test,
+        config.render,
+        background=config.data.background,
+        pictures=args.workdir / "pictures",
     )
     result |= {"steps": progress.step, "train_seconds": progress.seconds}
     write_json(args.workdir / "metrics.json", result)

@@ -40,33 +40,53 @@ class EncodingConfig:
     log2_table_size: int = 19  # H, the whole mesh's budget a level
     min_log2_tet_table: int = 8
     max_log2_tet_table: int = 11
-    log2_tet_table: int | None = None  # overrides the rule H' = clip(H - floor(log2 T + 1), min, max)
+    log2_tet_table: int | None = (
+        None  # overrides the rule H' = clip(H - floor(log2 T + 1), min, max)
+    )
     init_scale: float = 1e-2
 
     def __post_init__(self) -> None:
-        _require(self.layout in typing.get_args(Layout), self, "layout", f"one of {typing.get_args(Layout)}")
+        _require(
+            self.layout in typing.get_args(Layout),
+            self,
+            "layout",
+            f"one of {typing.get_args(Layout)}",
+        )
         _require(
             self.interpolation in typing.get_args(Interpolation),
-            self, "interpolation", f"one of {typing.get_args(Interpolation)}",
+            self,
+            "interpolation",
+            f"one of {typing.get_args(Interpolation)}",
         )
         _require(self.num_levels >= 1, self, "num_levels", ">= 1")
         _require(self.features_per_level >= 1, self, "features_per_level", ">= 1")
         _require(self.base_resolution >= 1, self, "base_resolution", ">= 1")
         _require(self.growth >= 1.0, self, "growth", ">= 1")
-        _require(max(self.resolutions) <= 4096, self, "num_levels", "such that the finest resolution is <= 4096")
+        _require(
+            max(self.resolutions) <= 4096,
+            self,
+            "num_levels",
+            "such that the finest resolution is <= 4096",
+        )
         _require(
             1 <= self.min_log2_tet_table <= self.max_log2_tet_table <= 20,
-            self, "min_log2_tet_table", "in [1, max_log2_tet_table <= 20]",
+            self,
+            "min_log2_tet_table",
+            "in [1, max_log2_tet_table <= 20]",
         )
         _require(
             self.log2_tet_table is None or 1 <= self.log2_tet_table <= 20,
-            self, "log2_tet_table", "None or in [1, 20]",
+            self,
+            "log2_tet_table",
+            "None or in [1, 20]",
         )
 
     @property
     def resolutions(self) -> tuple[int, ...]:
         """Grid resolution N_l = round(base * growth**l) of each level."""
-        return tuple(round(self.base_resolution * self.growth**level) for level in range(self.num_levels))
+        return tuple(
+            round(self.base_resolution * self.growth**level) for level in range(self.num_levels)
+        )
 
     @property
     def feature_dim(self) -> int:
@@ -103,8 +123,10 @@ class MarchConfig:
     """Fixed sizes of the tet traversal (Sec. 3.4, Fig. 4). A change recompiles."""
 
     max_tets_per_ray: int = 64  # K
-    max_entries_per_ray: int = 8  # times that a ray enters the cage from outside
-    tile_size: int | None = None  # rays marched together; None: 256 on CPU, the whole batch elsewhere
+    max_entries_per_ray: int = 4  # times that a ray enters the cage from outside
+    tile_size: int | None = (
+        None  # rays marched together; None: 256 on CPU, the whole batch elsewhere
+    )
 
     def __post_init__(self) -> None:
         _require(self.max_tets_per_ray >= 1, self, "max_tets_per_ray", ">= 1")
@@ -124,16 +146,25 @@ class SamplerConfig:
     step: float = 0.125
     cone_angle: float = 0.0  # theta of Eq. 4: step growth per unit of measure travelled
     max_samples_per_ray: int = 128  # S; a longer ray gets larger steps and is reported
-    capacity_per_ray: int | None = None  # mean samples a ray in the packed buffer; None: S, no packing
+    capacity_per_ray: int | None = (
+        None  # mean samples a ray in the packed buffer; None: S, no packing
+    )
 
     def __post_init__(self) -> None:
-        _require(self.measure in typing.get_args(Measure), self, "measure", f"one of {typing.get_args(Measure)}")
+        _require(
+            self.measure in typing.get_args(Measure),
+            self,
+            "measure",
+            f"one of {typing.get_args(Measure)}",
+        )
         _require(self.step > 0 and math.isfinite(self.step), self, "step", "> 0")
         _require(self.cone_angle >= 0, self, "cone_angle", ">= 0")
         _require(self.max_samples_per_ray >= 1, self, "max_samples_per_ray", ">= 1")
         _require(
             self.capacity_per_ray is None or 1 <= self.capacity_per_ray <= self.max_samples_per_ray,
-            self, "capacity_per_ray", "None or in [1, max_samples_per_ray]",
+            self,
+            "capacity_per_ray",
+            "None or in [1, max_samples_per_ray]",
         )
 
 
@@ -146,7 +177,9 @@ class RenderConfig:
     density_measure: Literal["barycentric", "euclidean"] = "barycentric"  # Eq. 9 or Eq. 8
     near: float = 0.0  # in world units
     min_weight: float = 1e-4  # samples that contribute less are neither decoded nor trained
-    visible_per_ray: int | None = 16  # mean samples a ray above `min_weight`; None: decode all samples
+    visible_per_ray: int | None = (
+        16  # mean samples a ray above `min_weight`; None: decode all samples
+    )
 
     def __post_init__(self) -> None:
         _require(0 <= self.min_weight < 1, self, "min_weight", "in [0, 1)")
@@ -158,7 +191,9 @@ class RenderConfig:
         )
         _require(
             self.density_measure in ("barycentric", "euclidean"),
-            self, "density_measure", "'barycentric' or 'euclidean'",
+            self,
+            "density_measure",
+            "'barycentric' or 'euclidean'",
         )
         _require(self.near >= 0, self, "near", ">= 0")
 
@@ -180,7 +215,9 @@ class DataConfig:
     test_every: int = 8  # every n-th view is held out where there is no test split
 
     def __post_init__(self) -> None:
-        _require(self.resolution is None or self.resolution >= 8, self, "resolution", "None or >= 8")
+        _require(
+            self.resolution is None or self.resolution >= 8, self, "resolution", "None or >= 8"
+        )
         _require(self.background in ("white", "black"), self, "background", "'white' or 'black'")
         _require(self.test_every >= 2, self, "test_every", ">= 2")
 
@@ -223,7 +260,10 @@ class TrainConfig:
         _require(self.final_learning_rate > 0, self, "final_learning_rate", "> 0")
         _require(self.warmup_steps >= 0, self, "warmup_steps", ">= 0")
         _require(
-            self.background in typing.get_args(Background), self, "background", f"one of {typing.get_args(Background)}"
+            self.background in typing.get_args(Background),
+            self,
+            "background",
+            f"one of {typing.get_args(Background)}",
         )
         _require(self.log_every >= 1, self, "log_every", ">= 1")
         _require(self.eval_every >= 0, self, "eval_every", ">= 0")
@@ -254,7 +294,9 @@ def from_dict(cls: type[Config], values: dict[str, Any]) -> Config:
     hints = typing.get_type_hints(cls)
     unknown = sorted(set(values) - set(hints))
     if unknown:
-        raise ValueError(f"{cls.__name__} has no field {unknown[0]!r}; fields: {', '.join(sorted(hints))}")
+        raise ValueError(
+            f"{cls.__name__} has no field {unknown[0]!r}; fields: {', '.join(sorted(hints))}"
+        )
     built = {}
     for name, value in values.items():
         if dataclasses.is_dataclass(hints[name]) and isinstance(value, dict):

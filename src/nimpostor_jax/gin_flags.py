@@ -103,14 +103,17 @@ def config_from_args(args: argparse.Namespace) -> ExperimentConfig:
 
 def operative_config_text(config: ExperimentConfig) -> str:
     """Every field of a config as the text of a gin file, which `load_config` reads back equal."""
-    return "\n\n".join(
-        "\n".join(
-            f"{type(part).__name__}.{field.name} = {_literal(getattr(part, field.name))}"
-            for field in _leaf_fields(part)
+    return (
+        "\n\n".join(
+            "\n".join(
+                f"{type(part).__name__}.{field.name} = {_literal(getattr(part, field.name))}"
+                for field in _leaf_fields(part)
+            )
+            for part in _parts(config)
+            if _leaf_fields(part)
         )
-        for part in _parts(config)
-        if _leaf_fields(part)
-    ) + "\n"
+        + "\n"
+    )
 
 
 def run_cli(

@@ -32,7 +32,10 @@ def init_features(key: Array, entries: tuple[int, ...], config: EncodingConfig) 
 
 
 def encode(
-    tables: HashTables, config: EncodingConfig, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+    tables: HashTables,
+    config: EncodingConfig,
+    tet_ids: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
 ) -> Float[Array, "M L*F"]:
     """Features f_p of points given by tet and barycentric coordinates, all levels concatenated (Eq. 6).
 
@@ -48,7 +51,10 @@ def encode(
 
 
 def _canonical(
-    layout: HashLayout, config: EncodingConfig, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+    layout: HashLayout,
+    config: EncodingConfig,
+    tet_ids: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
 ) -> Coordinates:
     """Coordinates by ascending vertex id where neighbours share nodes, clipped to the simplex's range."""
     lambdas = jnp.clip(lambdas, 0, 1)
@@ -63,9 +69,11 @@ def _canonical(
 
 
 def _interpolate(
-    features: Float[Array, "entries F"], entries: list[Int[Array, " M"]], weights: list[Float[Array, " M"]]
+    features: Float[Array, "entries F"],
+    entries: list[Int[Array, " M"]],
+    weights: list[Float[Array, " M"]],
 ) -> Float[Array, "M F"]:
-    """Weighted sum of table rows. One gather a corner, accumulated: XLA's CPU back end is many times faster so."""
+    """Weighted sum of table rows; one gather a corner, accumulated, is what XLA's CPU back end does best."""
     return _gather_sum(features, tuple(entries), tuple(weights))
 
 
@@ -96,7 +104,11 @@ _gather_sum.defvjp(_gather_sum_forward, _gather_sum_backward)
 
 
 def _grid_corners(
-    layout: HashLayout, level: int, resolution: int, tet_ids: Int[Array, " M"], coordinates: Coordinates
+    layout: HashLayout,
+    level: int,
+    resolution: int,
+    tet_ids: Int[Array, " M"],
+    coordinates: Coordinates,
 ) -> tuple[list, list]:
     """Table entries and 4-linear weights of the 16 corners of each point's voxel."""
     low, fractions = [], []
@@ -115,7 +127,11 @@ def _grid_corners(
 
 
 def _simplex_corners(
-    layout: HashLayout, level: int, resolution: int, tet_ids: Int[Array, " M"], coordinates: Coordinates
+    layout: HashLayout,
+    level: int,
+    resolution: int,
+    tet_ids: Int[Array, " M"],
+    coordinates: Coordinates,
 ) -> tuple[list, list]:
     """Table entries and weights of the 4 corners of each point's simplex in the edgewise subdivision.
 

@@ -19,7 +19,12 @@ from jaxtyping import Int
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.types import HashLayout
 
-NGP_PRIMES = (1, 2654435761, 805459861, 3674653429)  # Instant-NGP's, and one more for the fourth coordinate
+NGP_PRIMES = (
+    1,
+    2654435761,
+    805459861,
+    3674653429,
+)  # Instant-NGP's, and one more for the fourth coordinate
 DENSE_RESOLUTION_LIMIT = 16  # (N + 1)^4 numbers a level must stay small beside the tables
 SIZE_BITS = 5  # a region is packed as offset << SIZE_BITS | log2(size)
 
@@ -30,7 +35,10 @@ def slab_half_width(config: EncodingConfig) -> int:
 
 
 def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> tuple[HashLayout, tuple[int, ...]]:
-    """The layout for a mesh's tets and the number of entries of each level."""
+    """The layout for a mesh's tets and the number of entries of each level.
+
+    Raises ValueError where a level's entries cannot be addressed in 32 bits.
+    """
     tets = np.asarray(tets)
     if config.layout == "per_tet":
         regions, entries, ranks = _per_tet(len(tets), config)
@@ -41,6 +49,11 @@ def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> tuple[
         ascending = np.take_along_axis(tets, order, axis=1)
         regions, entries, ranks = _per_simplex(ascending, config)
         multipliers = _vertex_multipliers(ascending)
+    if max(entries) > 1 << (31 - SIZE_BITS):
+        raise ValueError(
+            f"a level of {max(entries)} entries for {len(tets)} tets is more than 2**{31 - SIZE_BITS}; "
+            "lower EncodingConfig.min_log2_tet_table or log2_tet_table"
+        )
     layout = HashLayout(
         regions=tuple(jnp.asarray(r, jnp.int32) for r in regions),
         multipliers=jnp.asarray(multipliers, jnp.uint32),
@@ -157,7 +170,9 @@ def _dense_ranks(resolution: int, half_width: int, by_mask: bool) -> Int[np.ndar
 def _vertex_multipliers(tets: Int[np.ndarray, "T 4"]) -> np.ndarray:
     """A hash factor per mesh vertex, odd: a sub-simplex then hashes alike from all tets around it."""
     bits = tets.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):  # splitmix64's finaliser
+    for shift, factor in (
+        (30, 0xBF58476D1CE4E5B9),
+        (27, 0x94D049BB133111EB),
+    ):  # splitmix64's finaliser
         bits = (bits ^ (bits >> np.uint64(shift))) * np.uint64(factor)
     return ((bits ^ (bits >> np.uint64(31))) & np.uint64(0xFFFFFFFF)).astype(np.uint32) | np.uint32(1)
-

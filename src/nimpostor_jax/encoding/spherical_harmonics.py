@@ -6,7 +6,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def spherical_harmonics(directions: Float[Array, "*batch 3"], degree: int) -> Float[Array, "*batch degree**2"]:
+def spherical_harmonics(
+    directions: Float[Array, "*batch 3"], degree: int
+) -> Float[Array, "*batch degree**2"]:
     """The first degree**2 orthonormal basis functions (bands 0 to degree - 1; degree at most 4)."""
     if not 0 <= degree <= 4:
         raise ValueError(f"degree must be in [0, 4], got {degree}")
@@ -23,7 +25,11 @@ def spherical_harmonics(directions: Float[Array, "*batch 3"], degree: int) -> Fl
         second * x * z,
         second / 2 * (x * x - y * y),
     ]
-    outer, middle, inner = math.sqrt(35 / (32 * pi)), math.sqrt(105 / (4 * pi)), math.sqrt(21 / (32 * pi))
+    outer, middle, inner = (
+        math.sqrt(35 / (32 * pi)),
+        math.sqrt(105 / (4 * pi)),
+        math.sqrt(21 / (32 * pi)),
+    )
     basis += [
         outer * y * (3 * x * x - y * y),
         middle * x * y * z,

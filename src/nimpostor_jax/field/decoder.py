@@ -4,6 +4,7 @@ Parameters are plain dictionaries; every leaf has a leading axis over decoder se
 region can own its copy (Sec. 4.2). Axes: D decoder sets, M points.
 """
 
+import itertools
 from typing import Any
 
 import jax
@@ -41,7 +42,7 @@ def init_decoders(key: Array, config: ImpostorConfig, num_sets: int = 1) -> Para
     parameters: Parameters = {}
     for name, sizes in widths.items():
         layers = []
-        for fan_in, fan_out in zip(sizes[:-1], sizes[1:], strict=True):
+        for fan_in, fan_out in itertools.pairwise(sizes):
             key, layer_key = jax.random.split(key)
             weight = jax.random.normal(layer_key, (num_sets, fan_in, fan_out)) * (2 / fan_in) ** 0.5
             layers.append({"weight": weight, "bias": jnp.zeros((num_sets, fan_out))})

@@ -14,7 +14,7 @@ from nimpostor_jax.types import HashTables, NeuralImpostor, TetMesh
 
 
 def init_impostor(key: Array, mesh: TetMesh, config: ImpostorConfig) -> NeuralImpostor:
-    """An untrained impostor on a cage: packed tables, one decoder set. Host code (the layout is built once)."""
+    """An untrained impostor on a cage: packed tables, one decoder set. Host code: builds the layout."""
     table_key, decoder_key = jax.random.split(key)
     layout, entries = build_layout(np.asarray(mesh.tets), config.encoding)
     return NeuralImpostor(

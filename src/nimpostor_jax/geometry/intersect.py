@@ -17,7 +17,7 @@ Lanes = Float[Array, "*lanes"]
 
 
 def ray_frame(directions: Sequence[Lanes]) -> tuple[tuple[Lanes, ...], ...]:
-    """Three orthonormal axes for a unit direction (Duff et al. 2017): two across the ray, then the ray's own."""
+    """Orthonormal axes for a unit direction (Duff et al. 2017): two across the ray, then its own."""
     x, y, z = directions
     sign = jnp.where(z >= 0, 1.0, -1.0).astype(x.dtype)
     a = -1 / (sign + z)
@@ -25,10 +25,21 @@ def ray_frame(directions: Sequence[Lanes]) -> tuple[tuple[Lanes, ...], ...]:
     return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y), (x, y, z)
 
 
-def project(point: Sequence[Lanes], origin: Sequence[Lanes], axes: Sequence[Sequence[Lanes]]) -> tuple[Lanes, ...]:
-    """Coordinates of a point on the given axes, relative to the ray's origin."""
+def project(
+    point: Sequence[Lanes], origin: Sequence[Lanes], axes: Sequence[Sequence[Lanes]]
+) -> tuple[Lanes, ...]:
+    """Coordinates of a point on the given axes, relative to the ray's origin.
+
+    The same bits wherever it is compiled: without `_rounded`, some kernels would fuse multiply and add and
+    others not, and a ray through a vertex would pass it on different sides in different tets.
+    """
     dx, dy, dz = (p - o for p, o in zip(point, origin, strict=True))
-    return tuple(axis[0] * dx + axis[1] * dy + axis[2] * dz for axis in axes)
+    return tuple(_rounded(a[0] * dx) + _rounded(a[1] * dy) + _rounded(a[2] * dz) for a in axes)
+
+
+def _rounded(product: Lanes) -> Lanes:
+    """The product itself; the selection keeps compilers from fusing it with the addition that follows."""
+    return jnp.where(product == product, product, 0)
 
 
 def passes_left(u: Sequence[Lanes], v: Sequence[Lanes]) -> Bool[Array, "*lanes"]:

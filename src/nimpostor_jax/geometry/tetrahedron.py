@@ -19,7 +19,9 @@ def cross(a: Float[Array, "*batch 3"], b: Float[Array, "*batch 3"]) -> Float[Arr
     return jnp.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
-def corners(vertices: Float[Array, "V 3"], tets: Int[Array, "*batch 4"]) -> Float[Array, "*batch 4 3"]:
+def corners(
+    vertices: Float[Array, "V 3"], tets: Int[Array, "*batch 4"]
+) -> Float[Array, "*batch 4 3"]:
     """Positions of the four corners of each tet."""
     return vertices[tets]
 

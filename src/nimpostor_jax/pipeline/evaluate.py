@@ -42,7 +42,8 @@ def evaluate(
     With `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The time is the median
     over the views of a whole frame, with everything but compilation.
     """
-    per_view, seconds = [], []
+    per_view: list[dict[str, Any]] = []
+    seconds = []
     sized = frame_config(impostor, camera_of(views, 0), config)
     render_frame(impostor, camera_of(views, 0), sized)  # compiles
     for index, name in enumerate(views.names):
@@ -60,9 +61,16 @@ def evaluate(
             }
         )
         if pictures is not None:
-            panel = [truth, image, np.clip(4 * np.abs(truth - image), 0, 1), depth_picture(frame.depth, frame.opacity)]
+            panel = [
+                truth,
+                image,
+                np.clip(4 * np.abs(truth - image), 0, 1),
+                depth_picture(frame.depth, frame.opacity),
+            ]
             write_png(Path(pictures) / f"{Path(name).stem}.png", np.concatenate(panel, axis=1))
-    result: dict[str, Any] = {key: _mean([view[key] for view in per_view]) for key in ("psnr", "ssim", "lpips")}
+    result: dict[str, Any] = {
+        key: _mean([view[key] for view in per_view]) for key in ("psnr", "ssim", "lpips")
+    }
     result |= {"seconds_per_frame": float(np.median(seconds)), "per_view": per_view}
     lpips = "not installed" if result["lpips"] is None else f"{result['lpips']:.4f}"
     log(
@@ -80,7 +88,7 @@ def _mean(values: list[float | None]) -> float | None:
 def depth_picture(
     depth: Float[np.ndarray, "H W"], opacity: Float[np.ndarray, "H W"]
 ) -> Float[np.ndarray, "H W 3"]:
-    """Depth as grey, near bright, over the range of the picture's opaque part; black where there is nothing."""
+    """Depth as grey, near bright, over the range of what is opaque; black where there is nothing."""
     solid = opacity > 0.5
     if not solid.any():
         return np.zeros((*depth.shape, 3), np.float32)
@@ -115,7 +123,11 @@ def orbit(
     for azimuth in np.linspace(0, 2 * np.pi, num_frames, endpoint=False):
         elevation = np.radians(elevation_degrees)
         back = np.array(
-            [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+                np.sin(elevation),
+            ]
         )
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         pose = np.eye(4)

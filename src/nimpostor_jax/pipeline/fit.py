@@ -40,7 +40,16 @@ from nimpostor_jax.train.step import (
 )
 from nimpostor_jax.types import NeuralImpostor
 
-LOG_FIELDS = ("step", "seconds", "loss", "psnr", "rays_per_second", "learning_rate", "overflow", "coarsened")
+LOG_FIELDS = (
+    "step",
+    "seconds",
+    "loss",
+    "psnr",
+    "rays_per_second",
+    "learning_rate",
+    "overflow",
+    "coarsened",
+)
 MAX_OVERFLOW = 0.5  # share of a batch's rays that may be dropped before the buffers grow
 
 
@@ -83,7 +92,12 @@ def fit(
         progress = Progress(step=step, seconds=load_metadata(checkpoints, step)["seconds"])
         log(f"resuming {checkpoints} at step {step}")
 
-    impostor, pool, gradient, place = scene.impostor, scene.pool, loss_gradient, (lambda batch: batch)
+    impostor, pool, gradient, place = (
+        scene.impostor,
+        scene.pool,
+        loss_gradient,
+        (lambda batch: batch),
+    )
     if len(devices) > 1:
         mesh = device_mesh(devices)
         state, impostor, pool = jax.device_put((state, impostor, pool), replicated(mesh))
@@ -94,7 +108,12 @@ def fit(
     compiled = jax.jit(step_function, static_argnames="config", donate_argnums=0)
     key = jax.random.key(config.seed + 1)
     records = _LogFile(Path(workdir) / "log.csv" if workdir is not None else None, progress.step)
-    bar = tqdm(total=None if max_minutes else config.steps, initial=progress.step, unit="step", disable=None)
+    bar = tqdm(
+        total=None if max_minutes else config.steps,
+        initial=progress.step,
+        unit="step",
+        disable=None,
+    )
 
     def save() -> None:
         if checkpoints is not None and latest_step(checkpoints) != progress.step:
@@ -103,9 +122,9 @@ def fit(
 
     clock = None  # starts after the first step of this process, which compiles
     try:
-        while (share := progress.share(config, max_minutes)) < 1:
+        while (done := progress.share(config, max_minutes)) < 1:
             batch = place(draw_batch(key, progress.step, pool, config.rays_per_batch, config.background))
-            rate = learning_rate(config, share, progress.step)
+            rate = learning_rate(config, done, progress.step)
             state, metrics = compiled(state, impostor, batch, jnp.asarray(rate, jnp.float32), config=render)
             progress.step += 1
             bar.update()
@@ -118,7 +137,8 @@ def fit(
                 bar.set_postfix({k: f"{record[k]:.4g}" for k in ("loss", "psnr", "rays_per_second")})
                 if record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps:
                     render = _grow(render)
-                    log(f"step {progress.step}: {record['overflow']:.0%} of the rays overflowed; larger buffers")
+                    share = f"{record['overflow']:.0%}"
+                    log(f"step {progress.step}: {share} of the rays overflowed; larger buffers")
             clock = time.perf_counter()
             if progress.step % config.checkpoint_every == 0:
                 save()

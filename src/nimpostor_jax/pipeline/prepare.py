@@ -14,7 +14,12 @@ from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.preprocess.cage import Cage, cage_from_images
 from nimpostor_jax.preprocess.topology import build_tet_mesh
-from nimpostor_jax.preprocess.validate import check_coverage, check_tets, missed_foreground, quality_report
+from nimpostor_jax.preprocess.validate import (
+    check_coverage,
+    check_tets,
+    missed_foreground,
+    quality_report,
+)
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch

@@ -45,11 +45,21 @@ def build_tet_mesh(
     """
     vertices = np.asarray(vertices, np.float64)
     tets = np.asarray(tets)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or tets.ndim != 2 or tets.shape[1] != 4 or not len(tets):
-        raise ValueError(f"expected vertices [V,3] and tets [T,4], T >= 1; got {vertices.shape}, {tets.shape}")
+    if (
+        vertices.ndim != 2
+        or vertices.shape[1] != 3
+        or tets.ndim != 2
+        or tets.shape[1] != 4
+        or not len(tets)
+    ):
+        raise ValueError(
+            f"expected vertices [V,3] and tets [T,4], T >= 1; got {vertices.shape}, {tets.shape}"
+        )
     if tets.min() < 0 or tets.max() >= len(vertices):
         bad = np.flatnonzero((tets < 0).any(1) | (tets >= len(vertices)).any(1))[0]
-        raise ValueError(f"tet {bad} names vertex {tets[bad].tolist()}, but there are {len(vertices)} vertices")
+        raise ValueError(
+            f"tet {bad} names vertex {tets[bad].tolist()}, but there are {len(vertices)} vertices"
+        )
     if not np.isfinite(vertices).all():
         bad = np.flatnonzero(~np.isfinite(vertices).all(1))[0]
         raise ValueError(f"vertex {bad} is not finite: {vertices[bad]}")
@@ -68,7 +78,9 @@ def build_tet_mesh(
         vertices=jnp.asarray(local, dtype),
         tets=jnp.asarray(tets, jnp.int32),
         neighbors=jnp.asarray(neighbors),
-        object_ids=jnp.asarray(np.zeros(len(tets)) if object_ids is None else object_ids, jnp.int32),
+        object_ids=jnp.asarray(
+            np.zeros(len(tets)) if object_ids is None else object_ids, jnp.int32
+        ),
         boundary=_boundary_faces(local, tets, neighbors),
         tet_leaves=jnp.asarray(_leaves(local[tets].mean(axis=1), TETS_PER_LEAF)),
         center=jnp.asarray(center, dtype),
@@ -78,11 +90,15 @@ def build_tet_mesh(
 
 def world_vertices(mesh: TetMesh) -> Float[np.ndarray, "V 3"]:
     """The mesh's vertices in world coordinates, float64."""
-    return np.asarray(mesh.vertices, np.float64) * np.float64(mesh.scale) + np.asarray(mesh.center, np.float64)
+    return np.asarray(mesh.vertices, np.float64) * np.float64(mesh.scale) + np.asarray(
+        mesh.center, np.float64
+    )
 
 
 def _boundary_faces(
-    vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"], neighbors: Int[np.ndarray, "T 4"]
+    vertices: Float[np.ndarray, "V 3"],
+    tets: Int[np.ndarray, "T 4"],
+    neighbors: Int[np.ndarray, "T 4"],
 ) -> BoundaryFaces:
     tet_ids, local_faces = np.nonzero(neighbors < 0)
     width = -(-len(tet_ids) // MAX_FACE_CLUSTERS)
@@ -130,5 +146,7 @@ def _split_evenly(groups: Int[np.ndarray, "G N"]) -> Int[np.ndarray, "2G half"]:
     columns = np.arange(half)
     left = np.where(columns < first[:, None], groups[:, :half], -1)
     source = np.minimum(first[:, None] + columns, size - 1)
-    right = np.where(columns < (used - first)[:, None], np.take_along_axis(groups, source, axis=1), -1)
+    right = np.where(
+        columns < (used - first)[:, None], np.take_along_axis(groups, source, axis=1), -1
+    )
     return np.stack([left, right], axis=1).reshape(2 * num_groups, half)

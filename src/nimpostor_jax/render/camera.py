@@ -1,4 +1,4 @@
-"""Pinhole cameras and rays. OpenGL axes: the camera looks down -z, y is up; pixel centres at half integers."""
+"""Pinhole cameras and rays. OpenGL axes: the camera looks down -z, y is up; pixel centres lie at + 0.5."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float

@@ -49,21 +49,23 @@ def fit_capacities(
     Slots are rounded up to multiples of 8; `max_samples_per_ray` of the given config stays the limit.
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
+    most_tets, overflow, total = _demand(mesh, tables, rays, config)
     for _ in range(MAX_GROWTH):
-        most_tets, overflow, total = _demand(mesh, tables, rays, config)
         if not overflow:
             break
         config = grow_march(config)
-    else:
+        most_tets, overflow, total = _demand(mesh, tables, rays, config)
+    if overflow:
         raise ValueError(
             f"a ray crosses more than {config.march.max_tets_per_ray} tets or enters the cage more than "
-            f"{config.march.max_entries_per_ray} times; raise MarchConfig.max_tets_per_ray and max_entries_per_ray"
+            f"{config.march.max_entries_per_ray} times; "
+            "raise MarchConfig.max_tets_per_ray and max_entries_per_ray"
         )
     boundaries = step_boundaries(config.sampler)
     wanted = np.clip(np.searchsorted(boundaries, np.asarray(total) * (1 - 1e-5)), 0, len(boundaries) - 1)
     most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
     # Rays share the buffer, so that its mean load fluctuates much less than a single ray's.
-    mean = min(most, int(np.ceil((1 + (margin - 1) / 2) * wanted.mean())))
+    mean = min(most, max(1, int(np.ceil((1 + (margin - 1) / 2) * wanted.mean()))))
     march = dataclasses.replace(config.march, max_tets_per_ray=_round_up(margin * int(most_tets)))
     sampler = dataclasses.replace(config.sampler, max_samples_per_ray=most, capacity_per_ray=mean)
     return dataclasses.replace(config, march=march, sampler=sampler)

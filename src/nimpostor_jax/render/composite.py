@@ -22,7 +22,9 @@ def sample_weights(
 
 
 def blend_background(
-    color: Float[Array, "*batch 3"], opacity: Float[Array, "*batch"], background: Float[Array, "*#batch 3"]
+    color: Float[Array, "*batch 3"],
+    opacity: Float[Array, "*batch"],
+    background: Float[Array, "*#batch 3"],
 ) -> Float[Array, "*batch 3"]:
     """Premultiplied colour over a background."""
     return color + (1 - opacity)[..., None] * background

@@ -2,21 +2,33 @@
 
 import dataclasses
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.render.camera import image_pixels, pixel_rays
 from nimpostor_jax.render.capacity import MAX_GROWTH, fit_capacities, grow_march, rays_hit
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import march_tables
-from nimpostor_jax.types import Camera, NeuralImpostor, Rays, RenderOutput
+from nimpostor_jax.types import Camera, NeuralImpostor, Rays
 
 TILE = 16  # pixels; rays are rendered tile by tile, so that neighbours march together
 CHUNK = 8192  # rays a call
-PROBE = 2048  # rays from which buffer sizes are measured
+REPAIR_CHUNK = 1024  # rays a call with buffers of the largest size
+REPAIRABLE = 0.02  # share of overflowing rays that is cheaper to render again than to avoid
+
+
+class Frame(NamedTuple):
+    """A rendered image on the host, fields as in `RenderOutput`."""
+
+    color: Float[np.ndarray, "H W 3"]
+    opacity: Float[np.ndarray, "H W"]
+    depth: Float[np.ndarray, "H W"]
+    coarsened: Bool[np.ndarray, "H W"]
+
 
 _march_tables = jax.jit(march_tables)
 _render = jax.jit(render_rays, static_argnames="config")
@@ -37,73 +49,73 @@ def _tiled_pixels(height: int, width: int) -> jax.Array:
     return image_pixels(height, width).reshape(-1, 2)[_tile_order(height, width)]
 
 
-def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig, seed: int = 0) -> RenderConfig:
+def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> RenderConfig:
     """`config` with buffer sizes that fit this camera's view; use it for a whole animation.
 
-    Sizes are measured on a random share of the pixels that hit the cage. `render_frame` re-renders with
-    larger buffers what overflows nevertheless.
+    Sizes are measured on pixels spread over those that hit the cage. What overflows nevertheless,
+    `render_frame` renders again.
     """
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, camera.height, camera.width)
     hits = np.flatnonzero(rays_hit(impostor.mesh, tables, rays, config.march))
     if not hits.size:
         return config
-    chosen = np.random.default_rng(seed).choice(hits, PROBE)
-    probe = jax.tree.map(lambda x: x[np.sort(chosen)], rays)
-    return fit_capacities(impostor.mesh, tables, probe, config)
+    chosen = hits[np.linspace(0, hits.size - 1, CHUNK).round().astype(int)]
+    probe = jax.tree.map(lambda x: x[chosen], rays)
+    config = fit_capacities(impostor.mesh, tables, probe, config)
+    if config.visible_per_ray is None:
+        return config
+    output = _render(impostor, probe, config, tables=tables)
+    mean = 1.25 * float(np.mean(output.num_visible)) + 1
+    if mean <= config.visible_per_ray and np.mean(output.overflow) < REPAIRABLE:
+        return config
+    visible = 8 * int(np.ceil(max(mean, config.visible_per_ray) / 8))
+    most = config.sampler.max_samples_per_ray
+    return dataclasses.replace(config, visible_per_ray=None if 2 * visible > most else visible)
 
 
-def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> RenderOutput:
-    """Render one camera: arrays of shape [height, width, ...], NumPy.
+def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> Frame:
+    """Render one camera.
 
     Only pixels whose rays hit the cage are shaded, `CHUNK` at a time, so memory does not grow with the image
-    beyond its output. Chunks whose buffers overflow are rendered again with larger ones; raises RuntimeError
-    where 2**6 times the given sizes do not suffice. On several devices the chunks take turns.
+    beyond its output. Rays whose buffers overflow are rendered again, fewer at a time, in larger ones; raises
+    RuntimeError where 2**6 times the given sizes do not suffice. On several devices the chunks take turns.
     """
     height, width = camera.height, camera.width
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, height, width)
-    hits = np.flatnonzero(rays_hit(impostor.mesh, tables, rays, config.march))
-    devices = jax.local_devices() if jax.default_backend() == "cpu" else jax.local_devices()[:1]
-    chunk = min(CHUNK, max(TILE * TILE, -(-len(hits) // len(devices))))
-    replicas = [jax.device_put((impostor, tables), device) for device in devices]
-
-    def submit(chosen: np.ndarray, turn: int, config: RenderConfig) -> RenderOutput:
-        device = turn % len(devices)
-        chunk_rays = jax.device_put(jax.tree.map(lambda x: x[chosen], rays), devices[device])
-        replica, replica_tables = replicas[device]
-        return _render(replica, chunk_rays, config, tables=replica_tables)
-
-    chunks = [_padded(hits[start : start + chunk], chunk) for start in range(0, len(hits), chunk)]
-    outputs = [submit(chosen, turn, config) for turn, chosen in enumerate(chunks)]
+    pending = np.flatnonzero(rays_hit(impostor.mesh, tables, rays, config.march))
     order = _tile_order(height, width)
-    dtype = impostor.mesh.vertices.dtype
-    frame = RenderOutput(
-        color=np.zeros((height * width, 3), dtype),
-        opacity=np.zeros(height * width, dtype),
-        depth=np.zeros(height * width, dtype),
-        overflow=np.zeros(height * width, bool),
-        coarsened=np.zeros(height * width, bool),
+    dtype, pixels = impostor.mesh.vertices.dtype, height * width
+    frame = Frame(
+        color=np.zeros((pixels, 3), dtype),
+        opacity=np.zeros(pixels, dtype),
+        depth=np.zeros(pixels, dtype),
+        coarsened=np.zeros(pixels, bool),
     )
-    for turn, (chosen, output) in enumerate(zip(chunks, outputs, strict=True)):
-        larger = config
-        for _ in range(MAX_GROWTH):
-            if not np.any(output.overflow):
-                break
-            larger = _grow(larger)
-            output = submit(chosen, turn, larger)
-        else:
-            raise RuntimeError(
-                f"{int(np.sum(output.overflow))} of {len(chosen)} rays need more than "
-                f"{larger.march.max_tets_per_ray} tets; raise MarchConfig.max_tets_per_ray"
-            )
-        for target, source in zip(jax.tree.leaves(frame), jax.tree.leaves(output), strict=True):
-            target[order[chosen]] = np.asarray(source)
-    return jax.tree.map(lambda x: x.reshape(height, width, *x.shape[1:]), frame)
-
-
-def _padded(chosen: np.ndarray, size: int) -> np.ndarray:
-    return np.concatenate([chosen, np.full(size - len(chosen), chosen[-1])])
+    devices = jax.local_devices() if jax.default_backend() == "cpu" else jax.local_devices()[:1]
+    replicas = [jax.device_put((impostor, tables), device) for device in devices]
+    chunk = CHUNK
+    for _ in range(MAX_GROWTH):
+        chunks, outputs = [pending[i : i + chunk] for i in range(0, len(pending), chunk)], []
+        for turn, chosen in enumerate(chunks):
+            device, (replica, replica_tables) = turn % len(devices), replicas[turn % len(devices)]
+            padded = np.concatenate([chosen, np.full(chunk - len(chosen), chosen[-1])])
+            chunk_rays = jax.device_put(jax.tree.map(lambda x, p=padded: x[p], rays), devices[device])
+            outputs.append(_render(replica, chunk_rays, config, tables=replica_tables))
+        overflowed = []
+        for chosen, output in zip(chunks, outputs, strict=True):
+            for name, target in frame._asdict().items():
+                target[order[chosen]] = np.asarray(getattr(output, name))[: len(chosen)]
+            overflowed.append(chosen[np.asarray(output.overflow)[: len(chosen)]])
+        pending = np.concatenate(overflowed) if overflowed else pending[:0]
+        if not pending.size:
+            return Frame(*(x.reshape(height, width, *x.shape[1:]) for x in frame))
+        config, chunk = _grow(config), REPAIR_CHUNK
+    raise RuntimeError(
+        f"{pending.size} rays need more than {config.march.max_tets_per_ray} tets or "
+        f"{config.march.max_entries_per_ray} entries; raise MarchConfig's sizes"
+    )
 
 
 def _grow(config: RenderConfig) -> RenderConfig:
@@ -111,6 +123,6 @@ def _grow(config: RenderConfig) -> RenderConfig:
     return dataclasses.replace(grow_march(config), sampler=sampler, visible_per_ray=None)
 
 
-def to_image(output: RenderOutput, background: Float[np.ndarray, " 3"] | float = 1.0) -> Float[np.ndarray, "H W 3"]:
+def to_image(frame: Frame, background: Float[np.ndarray, " 3"] | float = 1.0) -> Float[np.ndarray, "H W 3"]:
     """A frame over a background colour, clipped to [0, 1]."""
-    return np.clip(output.color + (1 - output.opacity)[..., None] * np.asarray(background), 0, 1)
+    return np.clip(frame.color + (1 - frame.opacity)[..., None] * np.asarray(background), 0, 1)

@@ -8,10 +8,18 @@ from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sample_weights
-from nimpostor_jax.render.sampling import Samples, from_grid, sample_segments, select_samples, to_grid
+from nimpostor_jax.render.sampling import (
+    Samples,
+    from_grid,
+    sample_segments,
+    select_samples,
+    to_grid,
+)
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import MarchTables, march_tables, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, RenderOutput
+
+VISIBLE_SPREAD = 4  # one ray may have this many times the mean number of visible samples
 
 
 def render_rays(
@@ -42,7 +50,8 @@ def _integrate(
 ) -> RenderOutput:
     max_samples = config.sampler.max_samples_per_ray
     if config.visible_per_ray is not None:
-        samples = _visible(impostor, samples, config)
+        max_samples = min(max_samples, VISIBLE_SPREAD * config.visible_per_ray)
+        samples = _visible(impostor, samples, config, max_samples)
     point_features = field.features(impostor, samples.tet_ids, samples.lambdas)
     sigmas = field.density(impostor, samples.tet_ids, point_features)
     directions = field.encode_directions(impostor, rays.directions)[samples.rays]
@@ -61,10 +70,11 @@ def _integrate(
         depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * impostor.mesh.scale,
         overflow=overflow | samples.overflow,
         coarsened=samples.coarsened,
+        num_visible=samples.wanted,
     )
 
 
-def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig) -> Samples:
+def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig, max_visible: int) -> Samples:
     """The samples that contribute at least `min_weight`, found by a pass over densities without gradient.
 
     Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
@@ -77,4 +87,4 @@ def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig) -
     keep = from_grid(weights, seen) >= config.min_weight
     num_rays = samples.counts.shape[0]
     capacity = min(num_rays * (config.visible_per_ray or max_samples), samples.t.shape[0])
-    return select_samples(samples, keep, capacity)
+    return select_samples(samples, keep, capacity, max_visible)

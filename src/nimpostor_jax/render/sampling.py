@@ -31,12 +31,13 @@ class Samples:
     slots: Int[Array, " M"]  # position along the ray
     starts: Int[Array, " R"]  # packed index of the ray's first sample
     counts: Int[Array, " R"]  # samples of the ray that fit into the buffer
+    wanted: Int[Array, " R"]  # samples that the ray has
     overflow: Bool[Array, " R"]  # some of the ray's samples did not fit
     coarsened: Bool[Array, " R"]  # the ray needed more than S samples and got larger steps
 
 
 def segment_measure(segments: TetSegments, measure: Measure) -> Float[Array, "R K"]:
-    """Extent of each segment: L1 barycentric distance (Eq. 9), 1 a tet (Eq. 4 as printed), or length; 0 if empty."""
+    """Extent of each segment: L1 barycentric distance (Eq. 9), 1 a tet (Eq. 4), or length; 0 if empty."""
     if measure == "barycentric":
         return jnp.sum(jnp.abs(segments.lambda_exit - segments.lambda_enter), axis=-1)
     if measure == "alpha":
@@ -54,7 +55,10 @@ def step_boundaries(config: SamplerConfig) -> np.ndarray:
 
 
 def sample_segments(
-    segments: TetSegments, config: SamplerConfig, density_measure: Measure, jitter: Float[Array, " R"] | None = None
+    segments: TetSegments,
+    config: SamplerConfig,
+    density_measure: Measure,
+    jitter: Float[Array, " R"] | None = None,
 ) -> Samples:
     """Place samples on each ray: at the middle of each step, or stratified within it where `jitter` is given.
 
@@ -83,7 +87,7 @@ def sample_segments(
     low, high = boundaries[slots], boundaries[slots + 1]
     share = 0.5 if jitter is None else (jitter[rays] + GOLDEN_RATIO * slots) % 1
     position = (low + share * (high - low)) * scale[rays]
-    segment = _find_segment(ends, rays, position)
+    segment = _find_segment(ends, extents, rays, position)
 
     def pick(values: Float[Array, "R K *rest"]) -> Float[Array, "M *rest"]:
         return values[rays, segment]
@@ -105,18 +109,25 @@ def sample_segments(
         slots=slots,
         starts=jnp.minimum(firsts, capacity - 1),
         counts=counts,
+        wanted=wanted,
         overflow=counts < wanted,
         coarsened=fits > max_samples,
     )
 
 
 def _find_segment(
-    ends: Float[Array, "R K"], rays: Int[Array, " M"], position: Float[Array, " M"]
+    ends: Float[Array, "R K"],
+    extents: Float[Array, "R K"],
+    rays: Int[Array, " M"],
+    position: Float[Array, " M"],
 ) -> Int[Array, " M"]:
-    """The first segment of the ray that ends beyond each position, by bisection."""
+    """The first segment of the ray that ends beyond each position, by bisection; never an empty one."""
     num_slots = ends.shape[1]
-    flat, base = jax.lax.stop_gradient(ends).reshape(-1), rays * num_slots
-    position = jax.lax.stop_gradient(position)
+    ends, extents, position = jax.lax.stop_gradient((ends, extents, position))
+    # A parallel sum need not repeat itself over empty slots; the last position may round to the ray's end.
+    ends = jax.lax.cummax(jnp.where(extents > 0, ends, 0), axis=1)
+    position = jnp.minimum(position, ends[rays, -1] * (1 - 2 * jnp.finfo(ends.dtype).eps))
+    flat, base = ends.reshape(-1), rays * num_slots
     low = jnp.zeros_like(rays)
     width = 1 << max(0, (num_slots - 1).bit_length())
     while width > 1:
@@ -126,10 +137,11 @@ def _find_segment(
     return jnp.minimum(low, num_slots - 1)
 
 
-def select_samples(samples: Samples, keep: Bool[Array, " M"], capacity: int) -> Samples:
+def select_samples(samples: Samples, keep: Bool[Array, " M"], capacity: int, max_per_ray: int) -> Samples:
     """Only the samples to keep, packed into `capacity` slots in the same order.
 
-    `overflow` marks rays some of whose samples did not fit, besides those that had it already.
+    `overflow` marks rays some of whose samples did not fit, or which keep more than `max_per_ray`, besides
+    those that had it already.
     """
     num_rays = samples.counts.shape[0]
     keep &= samples.deltas > 0
@@ -145,10 +157,15 @@ def select_samples(samples: Samples, keep: Bool[Array, " M"], capacity: int) -> 
         t=samples.t[chosen],
         deltas=jnp.where(used, samples.deltas[chosen], 0),
         rays=rays,
-        slots=jnp.where(used, jnp.arange(capacity, dtype=jnp.int32) - firsts[rays], 0),
+        slots=jnp.where(
+            used,
+            jnp.minimum(jnp.arange(capacity, dtype=jnp.int32) - firsts[rays], max_per_ray - 1),
+            0,
+        ),
         starts=jnp.minimum(firsts, capacity - 1),
         counts=counts,
-        overflow=samples.overflow | (counts < wanted),
+        wanted=wanted,
+        overflow=samples.overflow | (counts < wanted) | (wanted > max_per_ray),
         coarsened=samples.coarsened,
     )
 
@@ -176,10 +193,16 @@ def _to_grid_forward(values, index, used, back_index, back_used):  # type: ignor
 
 
 def _to_grid_backward(residuals, cotangent):  # type: ignore[no-untyped-def]
-    # Packed and gridded samples correspond one to one: the transpose of this gather is a gather, not a scatter.
+    # Packed and gridded samples correspond one to one: the transpose of this gather is a gather.
     back_index, back_used = residuals
     flat = cotangent.reshape(-1, *cotangent.shape[2:])[back_index]
-    return jnp.where(back_used.reshape(-1, *(1,) * (flat.ndim - 1)), flat, 0), None, None, None, None
+    return (
+        jnp.where(back_used.reshape(-1, *(1,) * (flat.ndim - 1)), flat, 0),
+        None,
+        None,
+        None,
+        None,
+    )
 
 
 _to_grid.defvjp(_to_grid_forward, _to_grid_backward)

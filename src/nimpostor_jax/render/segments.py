@@ -1,17 +1,22 @@
 """Where each ray enters and leaves its tets: differentiable in vertices and rays (Eq. 3).
 
-Axes: R rays, K tet slots. Barycentric coordinates of the entry and exit points are computed within the faces
-that the ray passes, never from the tet's volume, so that slivers cost no precision.
+Axes: R rays, K tet slots. Barycentric coordinates of the entry and exit points are those within the faces
+that the ray passes, never derived from the tet's volume, so that slivers cost no precision.
 """
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.geometry.intersect import face_weights, project, ray_frame
 from nimpostor_jax.geometry.tetrahedron import FACES
-from nimpostor_jax.render.traverse import CODES_PER_TET, EXIT_FACES, Crossings
+from nimpostor_jax.render.traverse import CODES_PER_TET, EXIT_TRIANGLES, Crossings
 from nimpostor_jax.types import Rays, TetMesh, TetSegments
+
+_CODES = np.arange(CODES_PER_TET)
+ENTRY_TRIANGLES = np.array([np.roll(FACES[c // 9], -(c // 3 % 3)) for c in _CODES], np.int32)
+Ends = tuple[Float[Array, "R K"], Float[Array, "R K"], Float[Array, "R K 4"], Float[Array, "R K 4"]]
 
 
 def locate_segments(
@@ -21,55 +26,65 @@ def locate_segments(
 
     Segments without length (grazed corners, folded tets) and those before `near` become empty slots.
     """
-    used = crossings.codes >= 0
-    codes = jnp.maximum(crossings.codes, 0)
-    tet_ids = codes // CODES_PER_TET
-    entry_faces = (codes // 9) % 4
-    exit_faces = jnp.asarray(EXIT_FACES)[codes % CODES_PER_TET]
-
-    origin = tuple(rays.origins[:, None, i] for i in range(3))
-    axes = ray_frame(tuple(rays.directions[:, None, i] for i in range(3)))
-    points = []
-    for i in range(4):
-        corner = [mesh.vertices[:, axis][mesh.tets[:, i]][tet_ids] for axis in range(3)]  # a gather a column
-        points.append(project(tuple(corner), origin, axes))
-    points = _materialize(points)
-    per_face = [_face_coordinates(points, face) for face in FACES]
-    lambda_enter, lambda_exit = _materialize((_select(per_face, entry_faces), _select(per_face, exit_faces)))
-    t_enter = sum(weight * point[2] for weight, point in zip(lambda_enter, points, strict=True))
-    t_exit = sum(weight * point[2] for weight, point in zip(lambda_exit, points, strict=True))
-
-    used &= t_exit > jnp.maximum(t_enter, near)
+    geometry = (mesh.vertices, rays.origins, rays.directions)
+    t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, crossings.codes, crossings.ends)
+    used = (crossings.codes >= 0) & (t_exit > jnp.maximum(t_enter, near))
     length = jnp.where(used, t_exit - t_enter, 1)
-    skipped = jnp.clip((near - t_enter) / length, 0, 1)  # share of the segment that lies before `near`
-    lambda_enter = [a + skipped * (b - a) for a, b in zip(lambda_enter, lambda_exit, strict=True)]
+    skipped = jnp.clip((near - t_enter) / length, 0, 1)[..., None]  # share of the segment before `near`
     return TetSegments(
-        tet_ids=jnp.where(used, tet_ids, -1),
+        tet_ids=jnp.where(used, crossings.codes // CODES_PER_TET, -1),
         t_enter=jnp.where(used, jnp.maximum(t_enter, near), 0),
         t_exit=jnp.where(used, t_exit, 0),
-        lambda_enter=jnp.where(used[..., None], jnp.stack(lambda_enter, axis=-1), 0),
-        lambda_exit=jnp.where(used[..., None], jnp.stack(lambda_exit, axis=-1), 0),
+        lambda_enter=jnp.where(used[..., None], lambda_enter + skipped * (lambda_exit - lambda_enter), 0),
+        lambda_exit=jnp.where(used[..., None], lambda_exit, 0),
         overflow=crossings.overflow,
     )
 
 
-# XLA's CPU back end copies a fused computation into each of its consumers: without these cuts, every
-# output recomputes all four faces, for seven times the arithmetic.
-_materialize = jax.lax.optimization_barrier
+@jax.custom_jvp
+def _ends(
+    geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "R K"], ends: Float[Array, "6 R K"]
+) -> Ends:
+    """t and coordinates at both ends, as marched; the derivatives are those of `_recomputed_ends`."""
+    local = jnp.maximum(codes, 0) % CODES_PER_TET
+    lambdas = [
+        _spread(jnp.asarray(triangles)[local], ends[start + 1], ends[start + 2])
+        for start, triangles in ((0, ENTRY_TRIANGLES), (3, EXIT_TRIANGLES))
+    ]
+    return ends[0], ends[3], lambdas[0], lambdas[1]
 
 
-def _face_coordinates(points: list, face: tuple[int, int, int]) -> list[Float[Array, "R K"]]:
-    """The tet's four coordinates of the point where the ray meets one of its faces."""
-    weights = dict(zip(face, face_weights(*(points[i] for i in face)), strict=True))
-    zero = jnp.zeros_like(points[0][0])
-    return [weights.get(i, zero) for i in range(4)]
+@_ends.defjvp
+def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Ends, Ends]:
+    geometry, tets, codes, _ = primals
+    _, tangents_out = jax.jvp(lambda g: _recomputed_ends(g, tets, codes), (geometry,), (tangents[0],))
+    return _ends(*primals), tangents_out
 
 
-def _select(per_face: list, faces: Int[Array, "R K"]) -> list[Float[Array, "R K"]]:
-    chosen = []
+def _recomputed_ends(geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "R K"]) -> Ends:
+    """What the march computed, as a differentiable function of vertices, origins and directions."""
+    vertices, origins, directions = geometry
+    codes = jnp.maximum(codes, 0)
+    tet_ids, local = codes // CODES_PER_TET, codes % CODES_PER_TET
+    origin = tuple(origins[:, None, i] for i in range(3))
+    axes = ray_frame(tuple(directions[:, None, i] for i in range(3)))
+    ts, lambdas = [], []
+    for triangles in (ENTRY_TRIANGLES, EXIT_TRIANGLES):
+        triangle = jnp.asarray(triangles)[local]
+        corners = [vertices[tets[tet_ids, triangle[..., j]]] for j in range(3)]
+        a, b, c = (project(tuple(corner[..., i] for i in range(3)), origin, axes) for corner in corners)
+        wa, wb, wc = face_weights(a, b, c)
+        ts.append(wa * a[2] + wb * b[2] + wc * c[2])
+        lambdas.append(_spread(triangle, wa, wb))
+    return ts[0], ts[1], lambdas[0], lambdas[1]
+
+
+def _spread(
+    triangle: Int[Array, "R K 3"], wa: Float[Array, "R K"], wb: Float[Array, "R K"]
+) -> Float[Array, "R K 4"]:
+    """The tet's four coordinates from weights of three of its corners."""
+    columns = []
     for i in range(4):
-        value = per_face[0][i]
-        for face in range(1, 4):
-            value = jnp.where(faces == face, per_face[face][i], value)
-        chosen.append(value)
-    return chosen
+        a, b, c = (triangle[..., j] == i for j in range(3))
+        columns.append(jnp.where(a, wa, jnp.where(b, wb, jnp.where(c, 1 - wa - wb, 0))))
+    return jnp.stack(columns, axis=-1)

@@ -10,8 +10,10 @@ A crossing is coded as 9 * (4 tet + f) + 3 r + s: the tet was entered by the fac
 corners the walk holds in the order FACES[f] rotated by r, and left by the face without the s-th of these.
 
 Axes: R rays, K tet slots, B entries, T tets; inside a tile the rays (lanes) are the last axis.
-The walk is integer work; `segments.locate_segments` derives differentiable coordinates from its codes.
+Nothing here is differentiable; `segments.locate_segments` makes differentiable coordinates of the result.
 """
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -57,9 +59,14 @@ class MarchTables:
 
 @struct.dataclass
 class Crossings:
-    """The tets that each ray's line crosses, as codes, in order along the line."""
+    """The tets that each ray's line crosses, as codes, in order along the line.
+
+    `ends` holds t and the weights of the first two corners of the triangle held before the crossing, then
+    the same three numbers of the triangle after it (`EXIT_TRIANGLES`).
+    """
 
     codes: Int[Array, "R K"]  # -1 marks an empty slot
+    ends: Float[Array, "6 R K"]
     overflow: Bool[Array, " R"]  # more tets or entries than slots
 
 
@@ -115,73 +122,93 @@ def traverse(tables: MarchTables, rays: Rays, config: MarchConfig) -> Crossings:
         padded = jnp.pad(jax.lax.stop_gradient(x), padding, mode="edge") if num_rays else x
         return padded.reshape(num_tiles, tile, 3).transpose(0, 2, 1)
 
-    codes, overflow = jax.lax.map(
-        lambda rays: _march_tile(tables, config, *rays), (tiles(rays.origins), tiles(rays.directions))
+    codes, ends, overflow = jax.lax.map(
+        lambda rays: _march_tile(tables, config, *rays),
+        (tiles(rays.origins), tiles(rays.directions)),
     )
-    codes = codes.transpose(0, 2, 1).reshape(num_tiles * tile, config.max_tets_per_ray)
-    return Crossings(codes=codes[:num_rays], overflow=overflow.reshape(-1)[:num_rays])
+    slots = config.max_tets_per_ray
+    codes = codes.transpose(0, 2, 1).reshape(num_tiles * tile, slots)
+    ends = ends.transpose(2, 0, 3, 1).reshape(6, num_tiles * tile, slots)
+    return Crossings(
+        codes=codes[:num_rays], ends=ends[:, :num_rays], overflow=overflow.reshape(-1)[:num_rays]
+    )
 
 
 def _march_tile(
-    tables: MarchTables, config: MarchConfig, origins: Float[Array, "3 lanes"], directions: Float[Array, "3 lanes"]
-) -> tuple[Int[Array, "K lanes"], Bool[Array, " lanes"]]:
-    origin, axes = tuple(origins), ray_frame(tuple(directions))
-    across = axes[:2]
+    tables: MarchTables,
+    config: MarchConfig,
+    origins: Float[Array, "3 lanes"],
+    directions: Float[Array, "3 lanes"],
+) -> tuple[Int[Array, "K lanes"], Float[Array, "K 6 lanes"], Bool[Array, " lanes"]]:
+    # One rounding of the axes for all kernels below, for the reason that `project` gives.
+    origin, axes = tuple(origins), jax.lax.optimization_barrier(ray_frame(tuple(directions)))
     entry_holds, num_entries = _find_entries(tables, config, origin, axes)
 
     lanes, slots = origins.shape[1], config.max_tets_per_ray
 
-    def held_points(hold: Int[Array, " lanes"]) -> Float[Array, "3 2 lanes"]:
-        """Projected corners of the face that is entered, from scratch (at the cage's boundary)."""
+    def held_triangle(
+        hold: Int[Array, " lanes"],
+    ) -> tuple[Float[Array, "3 3 lanes"], Float[Array, "3 lanes"]]:
+        """The face that is entered, projected from scratch (at the cage's boundary), and where it is met."""
         face = hold // 3
         held = jnp.asarray(FACES, jnp.int32)[face & 3]  # boundary faces are held unrotated
-        points = [project(tuple(tables.corners[:, (face & ~3) + held[:, j]]), origin, across) for j in range(3)]
-        return jnp.stack([jnp.stack(point) for point in points])
+        points = [project(tuple(tables.corners[:, (face & ~3) + held[:, j]]), origin, axes) for j in range(3)]
+        return jnp.stack([jnp.stack(point) for point in points]), _met(*points)
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
         return (state[0] < slots) & jnp.any(state[1] >= 0)
 
     def step(state: tuple) -> tuple:
-        slot, hold, points, entry, codes = state
+        slot, hold, points, met, entry, codes, ends = state
         active = hold >= 0
-        new = jnp.stack(project(tuple(tables.corners[:, jnp.maximum(hold, 0) // 3]), origin, across))
+        new = jnp.stack(project(tuple(tables.corners[:, jnp.maximum(hold, 0) // 3]), origin, axes))
         left = [passes_left(tuple(new), tuple(points[j])) for j in range(3)]
         # The way out is the new vertex's triangle around the ray: right of one held corner, left of the next.
         # If rounding leaves none (a sliver seen edge-on), any other face than the entry advances.
         exit_slot = jnp.where(~left[1] & left[2], 0, jnp.where(~left[2] & left[0], 1, 2))
         code = jnp.where(active, 3 * hold + exit_slot, -1)
-        codes = jax.lax.dynamic_update_index_in_dim(codes, code, slot, 0)
-
         first = jnp.where(exit_slot == 0, points[1], jnp.where(exit_slot == 1, points[2], points[0]))
         second = jnp.where(exit_slot == 0, points[2], jnp.where(exit_slot == 1, points[0], points[1]))
+        met_after = _met(tuple(new), tuple(first), tuple(second))
+        codes = jax.lax.dynamic_update_index_in_dim(codes, code, slot, 0)
+        ends = jax.lax.dynamic_update_index_in_dim(ends, jnp.concatenate([met, met_after]), slot, 0)
+
         points = jnp.stack([new, first, second])
         hold = jnp.where(active, tables.next_holds[jnp.maximum(code, 0)], -1)
         reenters = active & (hold < 0)
         hold = jnp.where(reenters, _pick(entry_holds, entry), hold)
         entry = entry + reenters.astype(jnp.int32)
         reenters &= hold >= 0
-        points = jax.lax.cond(
-            jnp.any(reenters),
-            lambda: jnp.where(reenters, held_points(jnp.maximum(hold, 0)), points),
-            lambda: points,
-        )
-        return slot + 1, hold, points, entry, codes
+
+        def reenter() -> tuple:
+            triangle, met_again = held_triangle(jnp.maximum(hold, 0))
+            return jnp.where(reenters, triangle, points), jnp.where(reenters, met_again, met_after)
+
+        points, met = jax.lax.cond(jnp.any(reenters), reenter, lambda: (points, met_after))
+        return slot + 1, hold, points, met, entry, codes, ends
 
     start = (
         jnp.zeros((), jnp.int32),
         entry_holds[0],  # 3 * (4 tet + f) + r; -1 when the ray is done
-        held_points(jnp.maximum(entry_holds[0], 0)),
+        *held_triangle(jnp.maximum(entry_holds[0], 0)),
         jnp.ones(lanes, jnp.int32),  # the next entry to take
         jnp.full((slots, lanes), -1, jnp.int32),
+        jnp.zeros((slots, 6, lanes), origins.dtype),
     )
-    _, hold, _, _, codes = jax.lax.while_loop(unfinished, step, start)
-    return codes, (hold >= 0) | (num_entries > config.max_entries_per_ray)
+    _, hold, _, _, _, codes, ends = jax.lax.while_loop(unfinished, step, start)
+    return codes, ends, (hold >= 0) | (num_entries > config.max_entries_per_ray)
+
+
+def _met(a: Sequence[Array], b: Sequence[Array], c: Sequence[Array]) -> Float[Array, "3 lanes"]:
+    """t at which the line meets a projected triangle, and the weights of its first two corners there."""
+    wa, wb, wc = face_weights(a, b, c)
+    return jnp.stack([wa * a[2] + wb * b[2] + wc * c[2], wa, wb])
 
 
 def _find_entries(
     tables: MarchTables, config: MarchConfig, origin: tuple, axes: tuple
 ) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"]]:
-    """The front-facing boundary faces on each lane's line, sorted by t: their holds (-1 pads) and their count."""
+    """The front-facing boundary faces on each lane's line by t: their holds (-1 pads) and count."""
     lanes, slots = origin[0].shape[0], config.max_entries_per_ray
     dtype = origin[0].dtype
     clusters, width = tables.face_holds.shape

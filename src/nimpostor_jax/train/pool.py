@@ -38,7 +38,7 @@ def build_pool(
     cast = jax.jit(lambda camera: pixel_rays(camera, grid))
     views, indices, missed, foreground = [], [], 0, 0
     for view in range(len(images)):
-        rays = cast(jax.tree.map(lambda x: x[view], cameras))
+        rays = cast(_one(cameras, view))
         hits = np.asarray(rays_hit(mesh, tables, rays, march))
         solid = images[view, ..., 3].reshape(-1) > 0.5
         missed += int(np.sum(solid & ~hits))
@@ -46,16 +46,24 @@ def build_pool(
         indices.append(np.flatnonzero(hits))
         views.append(np.full(len(indices[-1]), view))
     if not sum(map(len, indices)):
-        raise ValueError(f"no pixel of {len(images)} views hits the cage; is it in the cameras' world coordinates?")
+        raise ValueError(
+            f"no pixel of {len(images)} views hits the cage; is it in the cameras' world coordinates?"
+        )
     view_ids, pixel_ids = np.concatenate(views), np.concatenate(indices)
     flat = images.reshape(len(images), -1, 4)
     pool = PixelPool(
         views=jnp.asarray(view_ids, jnp.int32),
-        pixels=jnp.asarray(np.stack([pixel_ids % cameras.width, pixel_ids // cameras.width], axis=1), jnp.int32),
+        pixels=jnp.asarray(
+            np.stack([pixel_ids % cameras.width, pixel_ids // cameras.width], axis=1), jnp.int32
+        ),
         colors=jnp.asarray(flat[view_ids, pixel_ids]),
         cameras=cameras,
     )
     return pool, missed / max(foreground, 1)
+
+
+def _one(cameras: Camera, view: int) -> Camera:
+    return jax.tree.map(lambda x: x[view], cameras)
 
 
 @partial(jax.jit, static_argnames=("size", "background"))

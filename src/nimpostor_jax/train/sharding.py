@@ -1,6 +1,6 @@
 """Data parallelism around the pure step: rays are split over devices, everything else is replicated."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import jax
@@ -14,7 +14,7 @@ from nimpostor_jax.types import NeuralImpostor
 AXIS = "rays"
 
 
-def device_mesh(devices: list | None = None) -> Mesh:
+def device_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
     """A one-dimensional mesh over all (or the given) devices."""
     devices = devices or jax.local_devices()
     return jax.make_mesh((len(devices),), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
@@ -31,7 +31,9 @@ def data_parallel(mesh: Mesh) -> Callable[..., tuple[Parameters, Metrics]]:
         parameters: Parameters, impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig
     ) -> tuple[Parameters, Metrics]:
         @partial(jax.shard_map, mesh=mesh, in_specs=(P(), P(), P(AXIS)), out_specs=P(), check_vma=False)
-        def shard(parameters: Parameters, impostor: NeuralImpostor, batch: RayBatch) -> tuple[Parameters, Metrics]:
+        def shard(
+            parameters: Parameters, impostor: NeuralImpostor, batch: RayBatch
+        ) -> tuple[Parameters, Metrics]:
             return jax.lax.pmean(loss_gradient(parameters, impostor, batch, config), AXIS)
 
         return shard(parameters, impostor, batch)

@@ -1,5 +1,6 @@
 """One training step: pure, (state, batch) -> (state, metrics), no device and no named axis inside."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -31,7 +32,7 @@ class RayBatch:
 
 @struct.dataclass
 class TrainState:
-    """What a step changes. The random stream is a function of seed and step, so nothing else need be saved."""
+    """What a step changes. Batches are functions of seed and step, so nothing else need be saved."""
 
     parameters: Parameters  # tables' features and decoders
     optimizer: optax.OptState
@@ -45,8 +46,8 @@ def trainable(impostor: NeuralImpostor) -> Parameters:
 
 def with_parameters(impostor: NeuralImpostor, parameters: Parameters) -> NeuralImpostor:
     """The impostor with its trained arrays replaced."""
-    tables = impostor.tables.replace(features=parameters["features"])
-    return impostor.replace(tables=tables, decoders=parameters["decoders"])
+    tables = dataclasses.replace(impostor.tables, features=parameters["features"])
+    return dataclasses.replace(impostor, tables=tables, decoders=parameters["decoders"])
 
 
 def make_optimizer() -> optax.GradientTransformation:
@@ -64,7 +65,9 @@ def learning_rate(config: TrainConfig, progress: float, step: int) -> float:
 def init_state(impostor: NeuralImpostor, optimizer: optax.GradientTransformation) -> TrainState:
     """The state before the first step."""
     parameters = trainable(impostor)
-    return TrainState(parameters=parameters, optimizer=optimizer.init(parameters), step=jnp.zeros((), jnp.int32))
+    return TrainState(
+        parameters=parameters, optimizer=optimizer.init(parameters), step=jnp.zeros((), jnp.int32)
+    )
 
 
 def render_loss(

@@ -1,0 +1,187 @@
+"""Time training and rendering on this machine; JSON with device, versions, compile and run times apart.
+
+    python experiments/benchmark.py --out=benchmark.json
+    python experiments/benchmark.py --data=DIR --workdir=out/mic --out=benchmark.json   # a trained impostor
+
+Without a workdir, an untrained impostor on a cage built from the scene's images is timed. Medians of repeats;
+`train_step_*` is the whole step: batch, forward, backward, update.
+"""
+
+import argparse
+import dataclasses
+import platform
+import resource
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.field.impostor import init_impostor
+from nimpostor_jax.gin_flags import add_flags, config_from_args, load_config, run_cli
+from nimpostor_jax.io.impostor_file import load_impostor
+from nimpostor_jax.pipeline.evaluate import camera_of, write_json
+from nimpostor_jax.pipeline.prepare import Scene, prepare, use_all_cores
+from nimpostor_jax.render.camera import to_local
+from nimpostor_jax.render.frame import frame_config, render_frame
+from nimpostor_jax.render.sampling import sample_segments
+from nimpostor_jax.render.segments import locate_segments
+from nimpostor_jax.render.traverse import march_tables, traverse
+from nimpostor_jax.train.pool import draw_batch
+from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.step import init_state, make_optimizer, train_step
+from nimpostor_jax.types import Camera, NeuralImpostor
+
+Row = dict[str, Any]
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, default=Path("out/benchmark.json"), help="JSON file")
+    parser.add_argument("--data", default="fluffy_ball", help="a nerf-synthetic folder, or a built-in scene")
+    parser.add_argument("--workdir", type=Path, help="of a training run: its impostor and cage are timed")
+    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--frame_size", type=int, default=800)
+    add_flags(parser)
+    args = parser.parse_args(argv)
+    use_all_cores()
+    cage, trained = None, None
+    config = config_from_args(args)
+    if args.workdir is not None:
+        config = load_config(
+            [args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or []
+        )
+        cage, trained = args.workdir / "cage.npz", load_impostor(args.workdir / "impostor.npz")
+    scene = prepare(config, args.data, cage=cage)
+    rows = [time_traversal(scene, args.repeats)]
+    for interpolation in ("grid", "simplex"):
+        rows.append(time_training(scene, interpolation, trained, args.repeats))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    rows.append(time_frame(trained or scene.impostor, scene, args.frame_size, args.repeats))
+    report = {
+        "device": f"{jax.devices()[0].device_kind} x {jax.local_device_count()}, {platform.machine()}",
+        "versions": {name: version(name) for name in ("nimpostor-jax", "jax", "jaxlib", "numpy")},
+        "scene": str(args.data),
+        "num_tets": scene.impostor.mesh.tets.shape[0],
+        "trained": trained is not None,
+        "peak_memory_gib_through_training": round(peak, 2),
+        "rows": rows,
+    }
+    write_json(args.out, report)
+    for row in rows:
+        print(
+            "  ".join(
+                f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
+                for key, value in row.items()
+            )
+        )
+    print(f"peak memory through training {peak:.2f} GiB; wrote {args.out}")
+
+
+def measure(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
+    """Seconds of the first call, which compiles, and the median of the following ones."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        times.append(time.perf_counter() - start)
+    return times[0], float(np.median(times[1:]))
+
+
+def time_traversal(scene: Scene, repeats: int) -> Row:
+    """Marching alone, on a training batch of incoherent rays."""
+    mesh = scene.impostor.mesh
+    batch = draw_batch(jax.random.key(0), 0, scene.pool, scene.config.train.rays_per_batch, "white")
+    tables, rays = jax.jit(march_tables)(mesh), to_local(mesh, batch.rays)
+    march = jax.jit(traverse, static_argnums=2)
+    first, median = measure(lambda: march(tables, rays, scene.render.march), repeats)
+    segments = int((march(tables, rays, scene.render.march).codes >= 0).sum())
+    return {
+        "name": "traverse_training_rays",
+        "ms": 1e3 * median,
+        "compile_s": first - median,
+        "rays": rays.origins.shape[0],
+        "ns_per_segment": 1e9 * median / segments,
+    }
+
+
+def time_training(scene: Scene, interpolation: str, trained: NeuralImpostor | None, repeats: int) -> Row:
+    """A whole step: drawing the batch, forward, backward, update."""
+    config: ExperimentConfig = scene.config
+    encoding = dataclasses.replace(config.impostor.encoding, interpolation=interpolation)
+    impostor = init_impostor(
+        jax.random.key(0),
+        scene.impostor.mesh,
+        dataclasses.replace(config.impostor, encoding=encoding),
+    )
+    if trained is not None and trained.config.encoding == encoding:
+        impostor = trained
+    optimizer = make_optimizer()
+    devices = jax.local_devices()
+    mesh = device_mesh(devices)
+    state = jax.device_put(init_state(impostor, optimizer), replicated(mesh))
+    frozen, pool = jax.device_put((impostor, scene.pool), replicated(mesh))
+    gradient = data_parallel(mesh)
+    step = jax.jit(partial(train_step, optimizer=optimizer, gradient=gradient), static_argnames="config")
+    size, key, rate = config.train.rays_per_batch, jax.random.key(0), jnp.float32(1e-3)
+
+    def call() -> Any:
+        batch = jax.device_put(draw_batch(key, 0, pool, size, "random"), over_rays(mesh))
+        return step(state, frozen, batch, rate, config=scene.render)
+
+    first, median = measure(call, repeats)
+    samples = count_samples(scene, size)
+    return {
+        "name": f"train_step_{encoding.layout}_{interpolation}",
+        "ms": 1e3 * median,
+        "compile_s": first - median,
+        "rays": size,
+        "samples": samples,
+        "samples_per_second": samples / median,
+        "rays_per_second": size / median,
+    }
+
+
+def count_samples(scene: Scene, size: int) -> int:
+    """Samples whose density the batch of `time_training` evaluates."""
+    mesh = scene.impostor.mesh
+    batch = draw_batch(jax.random.key(0), 0, scene.pool, size, "random")
+
+    @jax.jit
+    def counts() -> jax.Array:
+        rays = to_local(mesh, batch.rays)
+        segments = locate_segments(mesh, rays, traverse(march_tables(mesh), rays, scene.render.march))
+        return jnp.sum(sample_segments(segments, scene.render.sampler, "barycentric").counts)
+
+    return int(counts())
+
+
+def time_frame(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int) -> Row:
+    """A whole frame of the first test camera, at `size` pixels in width."""
+    camera = camera_of(scene.test, 0)
+    zoom = size / camera.width
+    large = Camera(
+        camera_to_world=camera.camera_to_world,
+        focal=camera.focal * zoom,
+        principal=camera.principal * zoom,
+        width=size,
+        height=round(camera.height * zoom),
+    )
+    sized = frame_config(impostor, large, scene.config.render)
+    first, median = measure(lambda: render_frame(impostor, large, sized), repeats)
+    return {
+        "name": f"frame_{large.width}x{large.height}",
+        "ms": 1e3 * median,
+        "compile_s": first - median,
+    }
+
+
+if __name__ == "__main__":
+    run_cli(main)

@@ -1,0 +1,47 @@
+"""Evaluate a trained run on its held-out views: writes metrics.json and pictures to the workdir.
+
+python experiments/evaluate.py --data=DIR --workdir=out/mic
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.io.blender import load_scene
+from nimpostor_jax.io.impostor_file import load_impostor
+from nimpostor_jax.io.scenes import resolve_scene
+from nimpostor_jax.pipeline.evaluate import evaluate, write_json
+from nimpostor_jax.pipeline.prepare import use_all_cores
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--data", required=True, help="a nerf-synthetic folder, or a built-in scene: fluffy_ball"
+    )
+    parser.add_argument("--workdir", required=True, type=Path, help="of a training run")
+    add_flags(parser)
+    args = parser.parse_args(argv)
+    saved = args.workdir / "config.gin"
+    if not saved.exists():
+        raise FileNotFoundError(
+            f"{saved} does not exist; train first (experiments/train.py --workdir={args.workdir})"
+        )
+    config = load_config([saved, *(args.gin_configs or [])], args.gin_bindings or [])
+    impostor = load_impostor(args.workdir / "impostor.npz")
+    use_all_cores()
+    _, test = load_scene(resolve_scene(args.data), config.data)
+    result = evaluate(
+        impostor,
+        test,
+        config.render,
+        background=config.data.background,
+        pictures=args.workdir / "pictures",
+    )
+    write_json(args.workdir / "metrics.json", result)
+
+
+if __name__ == "__main__":
+    run_cli(main)

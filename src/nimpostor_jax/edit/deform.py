@@ -1,0 +1,155 @@
+"""The first edit (Sec. 4.1): move the cage's vertices by a function of space, and nothing else.
+
+The field is a function of tet and barycentric coordinates, so tables and decoders stay as they are
+and the radiance moves along, piecewise linearly with the tets. The families are the maps of the
+deformed reference scenes (world coordinates, z up).
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
+from nimpostor_jax.types import NeuralImpostor
+
+SpaceMap = Callable[[Float[Array, "V 3"]], Float[Array, "V 3"]]
+Scalar = Float[Array, ""] | float
+
+
+def deform(impostor: NeuralImpostor, space_map: SpaceMap) -> NeuralImpostor:
+    """The impostor with its vertices moved by `space_map`, a function of world points [V, 3].
+
+    The map may use jnp (then this works under jit and grad, also with respect to the map's
+    parameters) or NumPy (it is given a read-only array). The mesh keeps its frame, also where
+    vertices leave it. Inverted tets are no error here: see `deformation_report`, or
+    `geometry.tetrahedron.num_inverted` under jit.
+
+    Raises:
+        ValueError: the map returns another shape, or (outside jit) a vertex is not finite
+        afterwards.
+    """
+    mesh = impostor.mesh
+    world = mesh.center + mesh.scale * mesh.vertices
+    moved = space_map(world)
+    if np.shape(moved) != world.shape:
+        raise ValueError(
+            f"the map must return one point for each of the {world.shape[0]} vertices, "
+            f"shape {world.shape}; got shape {np.shape(moved)}"
+        )
+    if not isinstance(moved, jax.core.Tracer):
+        bad = np.flatnonzero(~np.isfinite(np.asarray(moved)).all(axis=1))
+        if bad.size:
+            raise ValueError(
+                f"{bad.size} of {world.shape[0]} vertices are not finite after the map; first: "
+                f"vertex {bad[0]} at {np.asarray(world[bad[0]]).tolist()}; "
+                "restrict the map's parameters"
+            )
+    vertices = ((jnp.asarray(moved, world.dtype) - mesh.center) / mesh.scale).astype(world.dtype)
+    return dataclasses.replace(impostor, mesh=dataclasses.replace(mesh, vertices=vertices))
+
+
+@dataclasses.dataclass(frozen=True)
+class DeformationReport:
+    """How healthy a cage is: no inverted tets, no volume near zero."""
+
+    num_tets: int
+    inverted: Int[np.ndarray, " inverted"]  # ids of the tets without positive volume
+    smallest_volume: float  # signed, world units cubed
+
+    @property
+    def num_inverted(self) -> int:
+        """How many tets have no positive volume."""
+        return len(self.inverted)
+
+
+def deformation_report(impostor: NeuralImpostor) -> DeformationReport:
+    """Which tets of the cage have been turned inside out or flattened. Host code."""
+    mesh = impostor.mesh
+    volumes = np.asarray(signed_volumes(corners(mesh.vertices, mesh.tets)), np.float64)
+    return DeformationReport(
+        num_tets=len(volumes),
+        inverted=np.flatnonzero(volumes <= 0),
+        smallest_volume=float(volumes.min() * np.float64(mesh.scale) ** 3),
+    )
+
+
+def twist(k: Scalar) -> SpaceMap:
+    """Rotation about the z axis by the angle k z."""
+
+    def space_map(points: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
+        x, y, z = (points[:, i] for i in range(3))
+        cos, sin = jnp.cos(k * z), jnp.sin(k * z)
+        return jnp.stack([x * cos - y * sin, x * sin + y * cos, z], axis=-1)
+
+    return space_map
+
+
+def bend(c: Scalar) -> SpaceMap:
+    """The z axis rolled onto a circle of curvature c about (1/c, y, 0).
+
+    Raises ValueError for c = 0, and when it is applied outside of jit to a point with |x| >= 1/|c|, where
+    the map would fold space.
+    """
+    if not isinstance(c, jax.core.Tracer) and c == 0:
+        raise ValueError("bend: c must not be 0 (leave the vertices as they are)")
+
+    def space_map(points: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
+        x, y, z = (points[:, i] for i in range(3))
+        radius = 1 / c
+        _require_bendable(x, radius)
+        cos, sin = jnp.cos(c * z), jnp.sin(c * z)
+        return jnp.stack([radius + (x - radius) * cos, y, -(x - radius) * sin], axis=-1)
+
+    return space_map
+
+
+def _require_bendable(x: Float[Array, " V"], radius: Scalar) -> None:
+    if isinstance(x, jax.core.Tracer) or isinstance(radius, jax.core.Tracer):
+        return
+    bad = np.flatnonzero(np.abs(np.asarray(x)) >= np.abs(radius))
+    if bad.size:
+        raise ValueError(
+            f"bend: {bad.size} of {len(x)} vertices have |x| >= 1/|c| = {abs(float(radius)):g}; "
+            f"first: vertex {bad[0]} with x = {float(x[bad[0]]):g}; use a smaller c"
+        )
+
+
+def stretch(a: Scalar, b: Scalar) -> SpaceMap:
+    """A thickness that varies with height: x and y times 1 + a sin(b z), z times 1.1."""
+
+    def space_map(points: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
+        x, y, z = (points[:, i] for i in range(3))
+        scale = 1 + a * jnp.sin(b * z)
+        return jnp.stack([scale * x, scale * y, 1.1 * z], axis=-1)
+
+    return space_map
+
+
+def rigid(rotation: Float[Array, "3 3"], translation: Float[Array, " 3"]) -> SpaceMap:
+    """x' = rotation x + translation. Raises ValueError (outside jit) where rotation is none."""
+    if not isinstance(rotation, jax.core.Tracer):
+        matrix = np.asarray(rotation, np.float64)
+        # 1e-5: float32 rotations, composed a few times, pass
+        valid = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-5)
+        if not valid or np.linalg.det(matrix) < 0:
+            raise ValueError(f"rigid: rotation must be a 3x3 rotation matrix, got {matrix.tolist()}")
+
+    def space_map(points: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
+        # Elementwise: a float32 dot runs in reduced precision on accelerators.
+        matrix = jnp.asarray(rotation, points.dtype)
+        rotated = jnp.sum(matrix[None] * points[:, None, :], axis=-1)
+        return rotated + jnp.asarray(translation, points.dtype)
+
+    return space_map
+
+
+FAMILIES: dict[str, Callable[..., SpaceMap]] = {
+    "twist": twist,
+    "bend": bend,
+    "stretch": stretch,
+    "rigid": rigid,
+}
