@@ -266,6 +266,6 @@ def locate(
     inside = tets >= 0
     held = jnp.maximum(tets, 0)
     positions = corners(mesh.vertices, mesh.tets[held])
-    lambdas = barycentric(flat, positions)
-    lambdas = jnp.where(inside[:, None], lambdas, 0)
+    held_points = jnp.where(inside[:, None], flat, positions[:, 0])  # outside: finite gradients too
+    lambdas = jnp.where(inside[:, None], barycentric(held_points, positions), 0)
     return tets.reshape(points.shape[:-1]), lambdas.reshape(*points.shape[:-1], 4)
