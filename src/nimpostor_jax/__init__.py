@@ -1,1 +1,49 @@
-"""Neural Impostor in JAX: editable radiance fields on tetrahedral cages."""
+"""Neural Impostor in JAX: editable radiance fields on tetrahedral cages.
+
+The names below are the public interface; each is imported from its module on first use.
+"""
+
+import importlib
+from typing import Any
+
+_MODULES = {
+    "config": (
+        "CageConfig",
+        "DataConfig",
+        "DecoderConfig",
+        "EncodingConfig",
+        "ExperimentConfig",
+        "ImpostorConfig",
+        "MarchConfig",
+        "RenderConfig",
+        "SamplerConfig",
+        "TrainConfig",
+    ),
+    "types": ("Camera", "NeuralImpostor", "Rays", "RenderOutput", "TetMesh"),
+    "edit.deform": ("bend", "deform", "deformation_report", "rigid", "stretch", "twist"),
+    "field.impostor": ("init_impostor",),
+    "geometry.locate": ("locate",),
+    "gin_flags": ("load_config",),
+    "io.impostor_file": ("load_impostor", "save_impostor"),
+    "pipeline.evaluate": ("camera_of", "evaluate", "orbit"),
+    "pipeline.fit": ("fit",),
+    "pipeline.prepare": ("Scene", "prepare", "use_all_cores"),
+    "preprocess.cage": ("cage_from_images", "cage_from_surface"),
+    "preprocess.topology": ("build_tet_mesh", "world_vertices"),
+    "render.camera": ("image_pixels", "pixel_rays"),
+    "render.frame": ("frame_config", "render_frame", "to_image"),
+    "render.renderer": ("render_rays",),
+    "train.step": ("train_step",),
+}
+_HOME = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_HOME)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,6 +39,17 @@ def use_all_cores() -> None:
         jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
 
 
+def warn_of_slow_scatter() -> None:
+    """Warn on GPUs whose jaxlib compiles scatter-add, the tables' gradient, into a slow loop (jax#38806)."""
+    version = tuple(int(part) for part in jax.lib.__version__.split(".")[:3])
+    if jax.default_backend() == "gpu" and (0, 10, 2) <= version <= (0, 11, 0):
+        warnings.warn(
+            f"jaxlib {jax.lib.__version__} trains hash tables hundreds of times too slowly on GPUs; "
+            "install 0.11.1 or newer (Python 3.12 or newer)",
+            stacklevel=2,
+        )
+
+
 @dataclasses.dataclass(frozen=True)
 class Scene:
     """A prepared scene: what training starts from."""
@@ -66,6 +78,7 @@ def prepare(
         FileNotFoundError, ValueError: missing or inconsistent data, empty masks, a bad cage, or a cage that
             more than `CageConfig.max_missed_share` of the foreground's rays miss.
     """
+    warn_of_slow_scatter()
     train, test = load_scene(resolve_scene(data), config.data)
     log(f"{data}: {len(train)} training views, {len(test)} test views, {train.width} x {train.height}")
     vertices, tets = load_cage(config, train, cage, cage_output, log)

@@ -1,9 +1,12 @@
 """Pinhole cameras and rays. OpenGL axes: the camera looks down -z, y is up; pixel centres lie at + 0.5."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.types import Camera, Rays, TetMesh
+
+TILE = 16  # pixels on a tile's side
 
 
 def pixel_rays(camera: Camera, pixels: Float[Array, "*batch 2"]) -> Rays:
@@ -24,6 +27,15 @@ def image_pixels(height: int, width: int) -> Float[Array, "height width 2"]:
     """Centres of all pixels of an image."""
     y, x = jnp.meshgrid(jnp.arange(height) + 0.5, jnp.arange(width) + 0.5, indexing="ij")
     return jnp.stack([x, y], axis=-1)
+
+
+def tile_order(height: int, width: int) -> Int[np.ndarray, " pixels"]:
+    """Pixel indices tile by tile: rays that are neighbours in the list are neighbours in the image.
+
+    Traversal culls and marches consecutive rays together, so rays of an image should come in this order.
+    """
+    y, x = np.mgrid[0:height, 0:width]
+    return np.lexsort(((x % TILE).ravel(), (y % TILE).ravel(), (x // TILE).ravel(), (y // TILE).ravel()))
 
 
 def to_local(mesh: TetMesh, rays: Rays) -> Rays:

@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.render.camera import image_pixels, pixel_rays
+from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, fit_capacities, grow_march, rays_hit
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays
 
-TILE = 16  # pixels; rays are rendered tile by tile, so that neighbours march together
 CHUNK = 8192  # rays a call
 REPAIR_CHUNK = 1024  # rays a call with buffers of the largest size
 REPAIRABLE = 0.02  # share of overflowing rays that is cheaper to render again than to avoid
@@ -39,14 +38,8 @@ def _tiled_rays(camera: Camera, height: int, width: int) -> Rays:
     return pixel_rays(camera, _tiled_pixels(height, width))
 
 
-def _tile_order(height: int, width: int) -> np.ndarray:
-    """Pixel indices tile by tile."""
-    y, x = np.mgrid[0:height, 0:width]
-    return np.lexsort(((x % TILE).ravel(), (y % TILE).ravel(), (x // TILE).ravel(), (y // TILE).ravel()))
-
-
 def _tiled_pixels(height: int, width: int) -> jax.Array:
-    return image_pixels(height, width).reshape(-1, 2)[_tile_order(height, width)]
+    return image_pixels(height, width).reshape(-1, 2)[tile_order(height, width)]
 
 
 def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> RenderConfig:
@@ -85,7 +78,7 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, height, width)
     pending = np.flatnonzero(rays_hit(impostor.mesh, tables, rays, config.march))
-    order = _tile_order(height, width)
+    order = tile_order(height, width)
     dtype, pixels = impostor.mesh.vertices.dtype, height * width
     frame = Frame(
         color=np.zeros((pixels, 3), dtype),

@@ -9,7 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.config import Background, MarchConfig
-from nimpostor_jax.render.camera import image_pixels, pixel_rays
+from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import rays_hit
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.step import RayBatch
@@ -34,12 +34,14 @@ def build_pool(
     Raises ValueError where no pixel hits the cage.
     """
     tables = jax.jit(march_tables)(mesh)
-    grid = image_pixels(cameras.height, cameras.width).reshape(-1, 2)
+    order = tile_order(cameras.height, cameras.width)
+    grid = image_pixels(cameras.height, cameras.width).reshape(-1, 2)[order]
     cast = jax.jit(lambda camera: pixel_rays(camera, grid))
     views, indices, missed, foreground = [], [], 0, 0
     for view in range(len(images)):
         rays = cast(_one(cameras, view))
-        hits = np.asarray(rays_hit(mesh, tables, rays, march))
+        hits = np.zeros(len(order), bool)
+        hits[order] = rays_hit(mesh, tables, rays, march)
         solid = images[view, ..., 3].reshape(-1) > 0.5
         missed += int(np.sum(solid & ~hits))
         foreground += int(np.sum(solid))

@@ -1,0 +1,96 @@
+"""geometry.intersect: the side test and its ties, on which the walk rests."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from nimpostor_jax.geometry.intersect import face_weights, passes_left, project, ray_frame
+
+
+def columns(points):
+    return tuple(jnp.asarray(points, jnp.float32).T)
+
+
+def random_directions(rng):
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    random = rng.normal(size=(50, 3))
+    near_poles = np.array([[1e-7, 0, -1], [0, -1e-7, -1], [1e-4, 1e-4, -1]])
+    directions = np.concatenate([axes, random, near_poles])
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_ray_frame_is_right_handed_and_orthonormal(rng):
+    directions = random_directions(rng)
+    frame = np.stack([np.stack(np.broadcast_arrays(*axis), axis=-1) for axis in ray_frame(columns(directions))], axis=1)
+    assert_allclose(frame @ frame.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frame.shape), atol=1e-6)
+    assert_allclose(np.linalg.det(frame), 1, atol=1e-6)
+    assert_allclose(frame[:, 2], directions, atol=1e-7)
+
+
+def test_project_measures_along_the_axes(rng):
+    points, origins, directions = rng.normal(size=(3, 20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    axes = ray_frame(columns(directions))
+    across, up, along = project(columns(points), columns(origins), axes)
+    offset = points - origins
+    assert_allclose(along, np.sum(offset * directions, axis=1), atol=1e-6)
+    assert_allclose(across**2 + up**2 + along**2, np.sum(offset**2, axis=1), rtol=1e-5)
+
+
+# Integer points, so that products are exact and many lines pass through the ray.
+LATTICE = [(x, y) for x in (-2, -1, 0, 1, 2) for y in (-2, -1, 0, 1, 2)]
+
+
+def test_turning_an_edge_around_turns_the_answer():
+    edges = np.array([(u, v) for u, v in itertools.product(LATTICE, LATTICE) if u != v], np.float32)
+    u, v = edges[:, 0].T, edges[:, 1].T
+    assert_array_equal(passes_left(u, v), ~passes_left(v, u))
+
+
+def test_agrees_with_the_sign_of_the_area(rng):
+    u, v = rng.normal(size=(2, 2, 500)).astype(np.float32)
+    area = u[0].astype(float) * v[1] - u[1].astype(float) * v[0]
+    clear = np.abs(area) > 1e-6
+    assert_array_equal(passes_left(u, v)[clear], area[clear] > 0)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (1, 0), (0, 1), (-1, 1), (1, 2), (-1, -1)])
+def test_a_fan_is_hit_once_even_through_its_edges_and_centre(shift):
+    """Triangles around a vertex cover their union exactly once, wherever the ray (the origin) meets it."""
+    ring = np.array([(2, 0), (2, 2), (0, 2), (-2, 2), (-2, 0), (-2, -2), (0, -2), (2, -2)], np.float32) + shift
+    centre = np.array(shift, np.float32)
+    hits = 0
+    for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+        triangle = (centre, a, b)
+        sides = [bool(passes_left(tuple(p), tuple(q))) for p, q in zip(triangle, triangle[1:] + triangle[:1], strict=True)]
+        hits += all(sides)
+    assert hits == 1
+
+
+def test_face_weights_reproduce_the_origin(rng):
+    triangles = rng.normal(size=(300, 3, 2))
+    crosses = triangles[:, [0, 1, 2], 0] * triangles[:, [1, 2, 0], 1] - triangles[:, [0, 1, 2], 1] * triangles[:, [1, 2, 0], 0]
+    inside = np.all(crosses > 0.05, axis=1) | np.all(crosses < -0.05, axis=1)
+    assert inside.sum() > 20
+    triangles = triangles[inside]
+    weights = np.stack(face_weights(*(columns(triangles[:, i]) for i in range(3))), axis=-1)
+    assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
+    assert_allclose(np.sum(weights[..., None] * triangles, axis=1), 0, atol=1e-5)  # float32, coordinates up to 3
+
+
+def test_face_weights_stay_in_range_and_guard_edge_on_faces():
+    outside = [columns([[1.0, 1.0]]), columns([[2.0, 1.0]]), columns([[1.0, 3.0]])]
+    weights = np.stack(face_weights(*outside))
+    assert np.all(weights >= 0)
+    assert np.all(weights <= 1)
+    assert_allclose(weights.sum(), 1, atol=1e-6)
+
+    def first(x):
+        return jnp.sum(jnp.stack(face_weights((x, x), (2 * x, 2 * x), (3 * x, 3 * x))) * jnp.arange(3.0))
+
+    assert_allclose(np.stack(face_weights((1.0, 1.0), (2.0, 2.0), (3.0, 3.0))), 1 / 3, atol=1e-7)
+    assert jax.grad(first)(1.0) == 0

@@ -1,0 +1,94 @@
+"""The training run: it learns, it logs, and a killed run ends like one that was not."""
+
+import csv
+
+import jax
+import numpy as np
+import pytest
+
+from nimpostor_jax.gin_flags import load_config
+from nimpostor_jax.io.mesh_files import save_tets
+from nimpostor_jax.pipeline.evaluate import evaluate, orbit
+from nimpostor_jax.pipeline.fit import Progress, fit
+from nimpostor_jax.pipeline.prepare import prepare
+
+from .conftest import BINDINGS
+
+
+class Killed(Exception):
+    """Stands for the end of the process."""
+
+
+@pytest.fixture(scope="module")
+def scene(config, cage):
+    return prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
+
+
+def arrays(impostor):
+    return [np.asarray(leaf) for leaf in jax.tree.leaves((impostor.tables.features, impostor.decoders))]
+
+
+def test_killed_and_resumed_run_equals_one_that_was_not(cage, tmp_path):
+    config = load_config(bindings=[*BINDINGS, "TrainConfig.eval_every=5"])
+    scene = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
+
+    def die(impostor, step):
+        raise Killed
+
+    through, _ = fit(scene, workdir=tmp_path / "a", log=lambda _: None)
+    with pytest.raises(Killed):  # at step 5, two steps after the last checkpoint
+        fit(scene, workdir=tmp_path / "b", callback=die, log=lambda _: None)
+    messages = []
+    resumed, progress = fit(scene, workdir=tmp_path / "b", log=messages.append)
+    assert "step 3" in messages[0]
+    assert progress.step == 6
+    for a, b in zip(arrays(through), arrays(resumed), strict=True):
+        np.testing.assert_array_equal(a, b)
+    with (tmp_path / "b" / "log.csv").open() as file:
+        assert [int(row["step"]) for row in csv.DictReader(file)] == [1, 2, 4, 6]
+
+
+def test_loss_falls_and_time_budget_ends_the_run(scene):
+    losses = []
+    trained, progress = fit(scene, max_minutes=0.05, log=losses.append)
+    before = evaluate(scene.impostor, scene.test.select([0]), scene.config.render, log=lambda _: None)
+    after = evaluate(trained, scene.test.select([0]), scene.config.render, log=lambda _: None)
+    assert progress.seconds >= 3
+    assert after["psnr"] > before["psnr"] + 1  # an untrained fog against seconds of training
+
+
+def test_evaluation_writes_pictures(scene, tmp_path):
+    result = evaluate(
+        scene.impostor, scene.test.select([0, 1]), scene.config.render, pictures=tmp_path, log=lambda _: None
+    )
+    assert set(result) == {"psnr", "ssim", "lpips", "seconds_per_frame", "per_view"}
+    assert result["lpips"] is None  # pictures of 25 pixels are too small for it
+    assert len(result["per_view"]) == len(list(tmp_path.glob("*.png"))) == 2
+
+
+def test_schedule_follows_steps_or_the_clock(config):
+    progress = Progress(step=3, seconds=30.0)
+    assert progress.share(config.train, None) == 0.5
+    assert progress.share(config.train, 1.0) == 0.5
+
+
+def test_cage_beside_the_object_is_refused(config, cage, tmp_path):
+    with np.load(cage) as data:
+        save_tets(tmp_path / "beside.npz", data["V"] + 10.0, data["T"])
+    with pytest.raises(ValueError, match=r"beside\.npz.*miss"):
+        prepare(config, "fluffy_ball", cage=tmp_path / "beside.npz", log=lambda _: None)
+
+
+def test_checkpoint_of_another_configuration_is_refused(scene, cage, tmp_path):
+    fit(scene, workdir=tmp_path, log=lambda _: None)
+    other = load_config(bindings=[*BINDINGS, "EncodingConfig.num_levels=2"])
+    with pytest.raises(ValueError, match="num_levels"):
+        fit(prepare(other, "fluffy_ball", cage=cage, log=lambda _: None), workdir=tmp_path)
+
+
+def test_orbit_looks_at_the_object(scene):
+    for camera in orbit(scene.train, 3):
+        pose = np.asarray(camera.camera_to_world)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6)  # float32
+        toward_center = -pose[:3, 3] / np.linalg.norm(pose[:3, 3])
+        assert -pose[:3, 2] @ toward_center > 0.99  # the scene is centred near the origin
