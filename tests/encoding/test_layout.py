@@ -1,0 +1,150 @@
+"""encoding.layout: who owns which table entry."""
+
+import itertools
+
+import numpy as np
+import oracles
+import pytest
+from meshes import cube, delaunay, nonconvex, one_tet
+from numpy.testing import assert_array_equal
+
+from nimpostor_jax.config import EncodingConfig
+from nimpostor_jax.encoding.layout import SIZE_BITS, build_layout, slab_half_width
+
+KINDS = list(itertools.product(["per_simplex", "per_tet"], ["grid", "simplex"]))
+
+
+def config_of(layout, interpolation, **rest):
+    return EncodingConfig(layout=layout, interpolation=interpolation, **({"num_levels": 6} | rest))
+
+
+def reachable_nodes(resolution, half_width):
+    axis = np.arange(resolution + 1)
+    nodes = np.stack(np.meshgrid(axis, axis, axis, axis), axis=-1).reshape(-1, 4)
+    return nodes[np.abs(nodes.sum(axis=1) - resolution) <= half_width]
+
+
+def owner(layout_name, tet, corners, node):
+    """The sub-simplex that a node lies on, as a key equal for all tets that share it."""
+    if layout_name == "per_tet":
+        return ("tet", tet)
+    return tuple(int(v) for v, u in zip(corners, node, strict=True) if u > 0)
+
+
+@pytest.mark.parametrize("layout_name, interpolation", KINDS)
+def test_regions_never_alias(layout_name, interpolation):
+    """Each entry belongs to one sub-simplex, and all lie inside the table."""
+    _, tets = cube()
+    config = config_of(layout_name, interpolation, num_levels=4, log2_tet_table=8)
+    layout, entries = build_layout(tets, config)
+    order = np.asarray(layout.corner_order)
+    for level, resolution in enumerate(config.resolutions):
+        owners = {}
+        for tet in range(len(tets)):
+            for node in reachable_nodes(resolution, slab_half_width(config)):
+                entry = oracles.node_entry(layout, config, level, tet, node)
+                assert 0 <= entry < entries[level]
+                key = owner(layout_name, tet, tets[tet][order[tet]], node)
+                assert owners.setdefault(entry, key) == key
+
+
+@pytest.mark.parametrize("layout_name", ["per_simplex", "per_tet"])
+def test_packed_regions_are_disjoint_on_a_larger_mesh(layout_name):
+    _, tets = nonconvex()
+    config = config_of(layout_name, "grid", num_levels=7)
+    layout, entries = build_layout(tets, config)
+    for level in range(7):
+        regions = np.asarray(layout.regions[level])
+        dense = layout.dense_ranks[level] is not None
+        unique = np.unique(regions)
+        starts, sizes = unique >> SIZE_BITS, 1 << (unique & ((1 << SIZE_BITS) - 1))
+        ends = starts + (1 if dense else sizes)
+        assert np.all(starts[1:] >= ends[:-1])
+        assert ends.max() <= entries[level]
+        if not dense:
+            assert ends.max() == entries[level]  # nothing is wasted
+
+
+@pytest.mark.parametrize("layout_name, interpolation", KINDS)
+def test_dense_levels_are_collision_free_and_full(layout_name, interpolation):
+    _, tets = cube()
+    config = config_of(layout_name, interpolation, num_levels=3)
+    layout, entries = build_layout(tets, config)
+    order = np.asarray(layout.corner_order)
+    dense = 0
+    for level, resolution in enumerate(config.resolutions):
+        if layout.dense_ranks[level] is None:
+            continue
+        dense += 1
+        used = {}
+        for tet in range(len(tets)):
+            corners = tets[tet][order[tet]]
+            for node in reachable_nodes(resolution, slab_half_width(config)):
+                entry = oracles.node_entry(layout, config, level, tet, node)
+                place = (owner(layout_name, tet, corners, node), tuple(u for u in node if u or layout_name == "per_tet"))
+                assert used.setdefault(entry, place) == place
+        missing = set(range(entries[level])) - set(used)
+        assert len(missing) <= 1  # entry 0, the all-zero node, is only reachable at coarse levels
+    assert dense >= 2
+
+
+def test_neighbours_agree_on_the_nodes_of_their_common_face():
+    _, tets = delaunay(count=10)
+    for interpolation in ("grid", "simplex"):
+        config = config_of("per_simplex", interpolation, num_levels=5, log2_tet_table=8)
+        layout, _ = build_layout(tets, config)
+        order = np.asarray(layout.corner_order)
+        places = {}
+        for level, resolution in enumerate(config.resolutions):
+            nodes = reachable_nodes(resolution, 0)
+            for tet in range(len(tets)):
+                for node in nodes[(nodes == 0).any(axis=1)][::7]:
+                    corners = tets[tet][order[tet]]
+                    place = (level, *((int(v), int(u)) for v, u in zip(corners, node, strict=True) if u))
+                    entry = oracles.node_entry(layout, config, level, tet, node)
+                    assert places.setdefault(place, entry) == entry
+
+
+@pytest.mark.parametrize("interpolation", ["grid", "simplex"])
+@pytest.mark.parametrize("make", [one_tet, cube, delaunay, nonconvex])
+@pytest.mark.parametrize("log2", [8, 11])
+def test_per_simplex_is_never_larger_than_per_tet(make, interpolation, log2):
+    """At the paper's table sizes (Sec. 5.1): levels may grow with the resolution, never over the budget."""
+    _, tets = make()
+    sizes = {}
+    for name in ("per_simplex", "per_tet"):
+        config = config_of(name, interpolation, num_levels=9, log2_tet_table=log2)
+        sizes[name] = build_layout(tets, config)[1]
+    budget = len(tets) << log2
+    assert max(sizes["per_simplex"]) <= budget
+    assert max(sizes["per_tet"]) <= budget
+    assert sum(sizes["per_simplex"]) <= sum(sizes["per_tet"])
+
+
+def test_hashed_levels_use_the_budget():
+    """A limit that is respected by storing nothing would be worthless."""
+    _, tets = nonconvex()
+    _, entries = build_layout(tets, config_of("per_simplex", "grid", num_levels=8, log2_tet_table=8))
+    assert entries[-1] > 0.4 * (len(tets) << 8)  # sizes are powers of two
+
+
+def test_offsets_that_do_not_fit_their_integers_are_refused():
+    _, tets = nonconvex()
+    config = config_of("per_tet", "grid", num_levels=8, log2_tet_table=20)
+    with pytest.raises(ValueError, match="entries"):
+        build_layout(np.tile(tets, (3, 1)), config)
+
+
+def test_corner_order_sorts_by_vertex_id():
+    _, tets = delaunay(count=12)
+    layout, _ = build_layout(tets, config_of("per_simplex", "grid"))
+    ordered = np.take_along_axis(tets, np.asarray(layout.corner_order), axis=1)
+    assert np.all(np.diff(ordered, axis=1) > 0)
+    layout, _ = build_layout(tets, config_of("per_tet", "grid"))
+    assert_array_equal(layout.corner_order, np.broadcast_to(np.arange(4), tets.shape))
+
+
+def test_table_size_follows_the_paper():
+    """H' = clip(H - floor(log2 T + 1), 8, 11): the sizes that notes give for the paper's meshes."""
+    config = EncodingConfig(log2_table_size=19)
+    assert [config.tet_table_size(t) for t in (6, 294, 545, 1754, 100_000)] == [2048, 1024, 512, 256, 256]

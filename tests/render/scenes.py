@@ -1,0 +1,76 @@
+"""Tiny impostors, cameras and configs for the tests of the renderer and of training."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from meshes import MESHES
+from rays import unit
+
+from nimpostor_jax.config import (
+    DecoderConfig,
+    EncodingConfig,
+    ImpostorConfig,
+    MarchConfig,
+    RenderConfig,
+    SamplerConfig,
+)
+from nimpostor_jax.field.impostor import init_impostor
+from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.types import Camera
+
+FIELD = ImpostorConfig(
+    encoding=EncodingConfig(num_levels=2, growth=3.0, log2_tet_table=8),
+    decoder=DecoderConfig(density_hidden=4, appearance_hidden=4, appearance_layers=1, sh_degree=2),
+)
+RENDER = RenderConfig(
+    march=MarchConfig(max_tets_per_ray=8, max_entries_per_ray=2),
+    sampler=SamplerConfig(step=0.5, max_samples_per_ray=16),
+    visible_per_ray=None,
+)
+
+
+def exact(**changes):
+    """RENDER with changes, of the sampler too (`step`, `measure`, ...)."""
+    names = {f.name for f in dataclasses.fields(SamplerConfig)}
+    sampler = dataclasses.replace(RENDER.sampler, **{k: v for k, v in changes.items() if k in names})
+    return dataclasses.replace(RENDER, sampler=sampler, **{k: v for k, v in changes.items() if k not in names})
+
+
+def impostor(name="cube", dtype="float32", scale=1.0, offset=0.0, seed=0):
+    """An impostor whose random field is far from constant: parameters of order 1, moderate densities."""
+    vertices, tets = MESHES[name]()
+    mesh = build_tet_mesh(vertices * scale + offset, tets, dtype=dtype)
+    made = init_impostor(jax.random.key(seed), mesh, FIELD)
+    rng = np.random.default_rng(seed)
+    features = tuple(jnp.asarray(rng.normal(size=f.shape), dtype) for f in made.tables.features)
+    decoders = jax.tree.map(lambda x: jnp.asarray(0.7 * rng.normal(size=x.shape), dtype), made.decoders)
+    return made.replace(tables=made.tables.replace(features=features), decoders=decoders)
+
+
+def constant_density(made, bias):
+    """The impostor with density exp(bias) everywhere."""
+    density = [*made.decoders["density"][:-1], jax.tree.map(jnp.zeros_like, made.decoders["density"][-1])]
+    density[-1] = density[-1] | {"bias": density[-1]["bias"] + bias}
+    return made.replace(decoders=made.decoders | {"density": density})
+
+
+def look_at(position, target, dtype="float32"):
+    """A camera-to-world matrix (OpenGL axes)."""
+    back = unit(np.asarray(position, float) - np.asarray(target, float))
+    right = unit(np.cross([0.1, 0.2, 1.0], back))
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([right, np.cross(back, right), back], axis=1)
+    matrix[:3, 3] = position
+    return jnp.asarray(matrix, dtype)
+
+
+def camera(width=12, height=9, position=(2.3, 1.4, 1.9), target=(0.5, 0.5, 0.5), dtype="float32"):
+    return Camera(
+        camera_to_world=look_at(position, target, dtype),
+        focal=jnp.asarray([1.3 * width, 1.25 * width], dtype),
+        principal=jnp.asarray([width / 2, height / 2], dtype),
+        width=width,
+        height=height,
+    )
