@@ -32,7 +32,7 @@ class EncodingConfig:
     """
 
     layout: Layout = "per_simplex"
-    interpolation: Interpolation = "grid"
+    interpolation: Interpolation = "simplex"
     num_levels: int = 7
     features_per_level: int = 2
     base_resolution: int = 1

@@ -126,7 +126,7 @@ def run_ftetwild(
         )
         # -P: this folder's modules must not shadow installed ones.
         command = [sys.executable, "-P", str(_PROGRAM), str(given), str(result)]
-        child = subprocess.run(command, capture_output=True, text=True, errors="replace")
+        child = subprocess.run(command, capture_output=True, text=True, errors="replace", cwd=folder)
         if child.returncode > 0:  # a Python error; a crash of fTetWild ends by a signal
             raise RuntimeError(f"pytetwild failed: {child.stderr.strip()[-500:]}")
         if child.returncode < 0 or not result.is_file():
