@@ -211,7 +211,7 @@ class DataConfig:
     """How posed images are read."""
 
     resolution: int | None = None  # target image width in pixels; None: as stored
-    background: Background = "white"  # of the reference images in evaluation
+    background: Literal["white", "black"] = "white"  # of the reference images in evaluation
     test_every: int = 8  # every n-th view is held out where there is no test split
 
     def __post_init__(self) -> None:
@@ -290,7 +290,7 @@ def to_dict(config: Any) -> dict[str, Any]:
 
 
 def from_dict(cls: type[Config], values: dict[str, Any]) -> Config:
-    """Inverse of `to_dict`. Unknown keys and wrong types raise ValueError with the field's name."""
+    """Inverse of `to_dict`. Raises ValueError for unknown keys and TypeError for wrong types, by name."""
     hints = typing.get_type_hints(cls)
     unknown = sorted(set(values) - set(hints))
     if unknown:
@@ -301,23 +301,26 @@ def from_dict(cls: type[Config], values: dict[str, Any]) -> Config:
     for name, value in values.items():
         if dataclasses.is_dataclass(hints[name]) and isinstance(value, dict):
             value = from_dict(typing.cast(type, hints[name]), value)
+        _check_type(cls, name, value, hints[name])
         built[name] = value
-    config = cls(**built)
-    check_types(config)
-    return config
+    return cls(**built)
 
 
 def check_types(config: Any) -> None:
     """Raise TypeError naming the first field whose value is not of its annotated type (nested too)."""
     for name, hint in typing.get_type_hints(type(config)).items():
         value = getattr(config, name)
-        if not _matches(value, hint):
-            expected = getattr(hint, "__name__", str(hint)).replace("typing.", "")
-            raise TypeError(
-                f"{type(config).__name__}.{name} must be {expected}, got {value!r} ({type(value).__name__})"
-            )
+        _check_type(type(config), name, value, hint)
         if dataclasses.is_dataclass(value):
             check_types(value)
+
+
+def _check_type(cls: type, name: str, value: Any, hint: Any) -> None:
+    if _matches(value, hint):
+        return
+    options = typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
+    expected = " or ".join(map(repr, options)) or getattr(hint, "__name__", str(hint))
+    raise TypeError(f"{cls.__name__}.{name} must be {expected}, got {value!r} ({type(value).__name__})")
 
 
 def _matches(value: Any, hint: Any) -> bool:

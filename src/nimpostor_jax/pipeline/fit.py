@@ -59,6 +59,7 @@ class Progress:
 
     step: int = 0
     seconds: float = 0.0  # of training, without compilation and evaluation
+    growths: int = 0  # how often the buffers were doubled
 
     def share(self, config: TrainConfig, max_minutes: float | None) -> float:
         """Position in the schedule, 1 at its end: by steps, or by time where minutes are given."""
@@ -89,7 +90,8 @@ def fit(
     identity = {"cage": cage_fingerprint(scene.impostor.mesh)}
     if checkpoints is not None and latest_step(checkpoints) is not None:
         state, step = restore_checkpoint(checkpoints, state, scene.config, metadata=identity)
-        progress = Progress(step=step, seconds=load_metadata(checkpoints, step)["seconds"])
+        saved = load_metadata(checkpoints, step)
+        progress = Progress(step=step, seconds=saved["seconds"], growths=saved["growths"])
         log(f"resuming {checkpoints} at step {step}")
 
     impostor, pool, gradient, place = (
@@ -104,6 +106,8 @@ def fit(
         gradient = data_parallel(mesh)
         place = partial(jax.device_put, device=over_rays(mesh))
     render = scene.render
+    for _ in range(progress.growths):
+        render = _grow(render)
     step_function = partial(train_step, optimizer=optimizer, gradient=gradient)
     compiled = jax.jit(step_function, static_argnames="config", donate_argnums=0)
     key = jax.random.key(config.seed + 1)
@@ -117,7 +121,7 @@ def fit(
 
     def save() -> None:
         if checkpoints is not None and latest_step(checkpoints) != progress.step:
-            metadata = {**identity, "seconds": progress.seconds}
+            metadata = {**identity, "seconds": progress.seconds, "growths": progress.growths}
             save_checkpoint(checkpoints, progress.step, state, scene.config, metadata=metadata)
 
     clock = None  # starts after the first step of this process, which compiles
@@ -137,6 +141,7 @@ def fit(
                 bar.set_postfix({k: f"{record[k]:.4g}" for k in ("loss", "psnr", "rays_per_second")})
                 if record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps:
                     render = _grow(render)
+                    progress.growths += 1
                     share = f"{record['overflow']:.0%}"
                     log(f"step {progress.step}: {share} of the rays overflowed; larger buffers")
             clock = time.perf_counter()
