@@ -3,15 +3,34 @@
 import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-if "PYTEST_XDIST_WORKER" in os.environ:  # workers share the cores: more threads each only slow all of them down
-    flags = os.environ.get("XLA_FLAGS", "")
-    os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false"
 
 import jax
 import numpy as np
 import pytest
 
-jax.config.update("jax_num_cpu_devices", 2)  # for the tests of data parallelism and of frames on several devices
+jax.config.update(
+    "jax_num_cpu_devices", 2
+)  # for the tests of data parallelism and of frames on several devices
+
+
+CORE = {"geometry", "encoding", "field", "render", "train"}
+
+
+@pytest.fixture(autouse=True)
+def quick_compilation(request):
+    """The core's tests run small programs a few times: compiling them optimised would take most of the time.
+
+    A test that asks for the fixture `optimized` gets what users get.
+    """
+    quick = request.path.parent.name in CORE and "optimized" not in request.fixturenames
+    jax.config.update("jax_disable_most_optimizations", quick)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)
+
+
+@pytest.fixture
+def optimized():
+    """Compile this test's own programs (not those that other tests have compiled) as users do."""
 
 
 @pytest.fixture

@@ -102,7 +102,9 @@ def encode(features, layout, config, tet, coordinates):
     levels = []
     for level, resolution in enumerate(config.resolutions):
         table = np.asarray(features[level], np.float64)
-        terms = [w * table[node_entry(layout, config, level, tet, u)] for u, w in nodes(canonical, resolution) if w]
+        terms = [
+            w * table[node_entry(layout, config, level, tet, u)] for u, w in nodes(canonical, resolution) if w
+        ]
         levels.append(np.sum(terms, axis=0))
     return np.concatenate(levels)
 

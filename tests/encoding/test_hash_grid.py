@@ -62,8 +62,12 @@ def test_returns_a_nodes_own_feature_at_the_node(layout, interpolation, x64, rng
         ids = rng.integers(0, len(tets), COUNT).astype(np.int32)
         lambdas = np.zeros((COUNT, 4))
         np.put_along_axis(lambdas, order[ids], nodes / resolution, axis=1)
-        values = encode_jit(tables, config, jnp.asarray(ids), jnp.asarray(lambdas))[:, 2 * level : 2 * level + 2]
-        entries = [oracles.node_entry(tables.layout, config, level, t, n) for t, n in zip(ids, nodes, strict=True)]
+        values = encode_jit(tables, config, jnp.asarray(ids), jnp.asarray(lambdas))[
+            :, 2 * level : 2 * level + 2
+        ]
+        entries = [
+            oracles.node_entry(tables.layout, config, level, t, n) for t, n in zip(ids, nodes, strict=True)
+        ]
         assert_allclose(values, tables.features[level][np.array(entries)], atol=1e-12)
 
 
@@ -87,7 +91,9 @@ def test_weights_are_not_negative(layout, interpolation, x64, rng):
     ids, lambdas = random_points(tets, rng, COUNT)
 
     def total(features):
-        return jnp.sum(encode(tables.replace(features=features), config, jnp.asarray(ids), jnp.asarray(lambdas)))
+        return jnp.sum(
+            encode(tables.replace(features=features), config, jnp.asarray(ids), jnp.asarray(lambdas))
+        )
 
     for gradient in jax.jit(jax.grad(total))(tables.features):
         assert np.min(gradient) >= 0
@@ -118,7 +124,9 @@ def test_only_per_simplex_is_continuous_across_faces(layout, interpolation, mesh
     left, right = (encode_jit(tables, config, *side) for side in interior_face_points(tets, rng, COUNT))
     jump = np.abs(left - right).max(axis=0).reshape(LEVELS, 2).max(axis=1)
     if layout == "per_simplex":
-        assert_array_equal(jump < 1e-12, True)  # the same nodes with the same weights, summed in another order
+        assert_array_equal(
+            jump < 1e-12, True
+        )  # the same nodes with the same weights, summed in another order
     else:
         assert np.all(jump > 0.1)  # features are standard normal
 
@@ -168,8 +176,12 @@ def test_gradients_match_finite_differences_and_plain_autodiff(layout, interpola
     gradient = jax.jit(jax.grad(of_tables))(tables.features)
     nudge = tuple(rng.normal(size=f.shape) for f in tables.features)
     of_tables = jax.jit(of_tables)
-    exact = of_tables(tuple(f + d for f, d in zip(tables.features, nudge, strict=True))) - of_tables(tables.features)
-    assert_allclose(sum(np.sum(g * d) for g, d in zip(gradient, nudge, strict=True)), exact, rtol=1e-9)  # linear
+    exact = of_tables(tuple(f + d for f, d in zip(tables.features, nudge, strict=True))) - of_tables(
+        tables.features
+    )
+    assert_allclose(
+        sum(np.sum(g * d) for g, d in zip(gradient, nudge, strict=True)), exact, rtol=1e-9
+    )  # linear
 
     # Forward over reverse-free: the tables' gradient is also the transpose of the linear map, by autodiff.
     (transposed,) = jax.linear_transpose(plain_tables(tables, config, ids, lambdas), tables.features)(mix)
@@ -191,7 +203,11 @@ def plain_tables(tables, config, ids, lambdas):
 
     def apply(features):
         return jnp.concatenate(
-            [jnp.sum(f[p[..., 0].astype(int)] * p[..., 1:], axis=1) for f, p in zip(features, plans, strict=True)], axis=1
+            [
+                jnp.sum(f[p[..., 0].astype(int)] * p[..., 1:], axis=1)
+                for f, p in zip(features, plans, strict=True)
+            ],
+            axis=1,
         )
 
     return apply
@@ -200,7 +216,9 @@ def plain_tables(tables, config, ids, lambdas):
 @pytest.mark.parametrize("interpolation", ["grid", "simplex"])
 def test_gradients_are_finite_on_corners_edges_and_faces(interpolation):
     config, _, tables = tables_of("per_simplex", interpolation, dtype="float32")
-    lambdas = np.concatenate([np.eye(4), [[0.5, 0.5, 0, 0], [0, 0.25, 0.75, 0], [0.25] * 4, [0, 1 / 3, 1 / 3, 1 / 3]]])
+    lambdas = np.concatenate(
+        [np.eye(4), [[0.5, 0.5, 0, 0], [0, 0.25, 0.75, 0], [0.25] * 4, [0, 1 / 3, 1 / 3, 1 / 3]]]
+    )
     lambdas = jnp.asarray(lambdas, jnp.float32)
     total = jax.jit(jax.grad(lambda x: jnp.sum(encode(tables, config, jnp.zeros(8, jnp.int32), x))))
     gradient = total(lambdas)

@@ -81,7 +81,10 @@ def test_dense_levels_are_collision_free_and_full(layout_name, interpolation):
             corners = tets[tet][order[tet]]
             for node in reachable_nodes(resolution, slab_half_width(config)):
                 entry = oracles.node_entry(layout, config, level, tet, node)
-                place = (owner(layout_name, tet, corners, node), tuple(u for u in node if u or layout_name == "per_tet"))
+                place = (
+                    owner(layout_name, tet, corners, node),
+                    tuple(u for u in node if u or layout_name == "per_tet"),
+                )
                 assert used.setdefault(entry, place) == place
         missing = set(range(entries[level])) - set(used)
         assert len(missing) <= 1  # entry 0, the all-zero node, is only reachable at coarse levels

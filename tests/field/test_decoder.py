@@ -10,7 +10,8 @@ from nimpostor_jax.config import DecoderConfig, EncodingConfig, ImpostorConfig
 from nimpostor_jax.field.decoder import decode_appearance, decode_density, init_decoders, truncated_exp
 
 CONFIG = ImpostorConfig(
-    encoding=EncodingConfig(num_levels=2), decoder=DecoderConfig(density_hidden=4, appearance_hidden=6, sh_degree=2)
+    encoding=EncodingConfig(num_levels=2),
+    decoder=DecoderConfig(density_hidden=4, appearance_hidden=6, sh_degree=2),
 )
 
 

@@ -13,7 +13,8 @@ from nimpostor_jax.config import DecoderConfig, EncodingConfig, ImpostorConfig
 from nimpostor_jax.field import impostor as field
 
 CONFIG = ImpostorConfig(
-    encoding=EncodingConfig(num_levels=2, log2_tet_table=8), decoder=DecoderConfig(density_hidden=4, appearance_hidden=8)
+    encoding=EncodingConfig(num_levels=2, log2_tet_table=8),
+    decoder=DecoderConfig(density_hidden=4, appearance_hidden=8),
 )
 
 
@@ -41,7 +42,9 @@ def test_shapes_and_ranges(impostor, rng):
 
 
 def test_an_impostor_without_view_directions(rng):
-    config = dataclasses.replace(CONFIG, decoder=DecoderConfig(sh_degree=0, density_hidden=4, appearance_hidden=8))
+    config = dataclasses.replace(
+        CONFIG, decoder=DecoderConfig(sh_degree=0, density_hidden=4, appearance_hidden=8)
+    )
     impostor = field.init_impostor(jax.random.key(0), tet_mesh("cube"), config)
     ids, lambdas = points(rng)
     features = field.features(impostor, ids, lambdas)
@@ -54,7 +57,9 @@ def test_a_second_decoder_set_changes_only_its_own_tets(impostor, rng):
     """A local edit (Sec. 4.2): the touched tets get a copy, all others stay bit-identical."""
     ids, lambdas = points(rng)
     stacked = jax.tree.map(lambda x: jnp.concatenate([x, x + 0.3]), impostor.decoders)
-    edited = impostor.replace(decoders=stacked, decoder_index=impostor.decoder_index.at[jnp.array([1, 4])].set(1))
+    edited = impostor.replace(
+        decoders=stacked, decoder_index=impostor.decoder_index.at[jnp.array([1, 4])].set(1)
+    )
     features = field.features(impostor, ids, lambdas)
     before, after = field.density(impostor, ids, features), field.density(edited, ids, features)
     touched = np.isin(ids, [1, 4])

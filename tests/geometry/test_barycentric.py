@@ -66,7 +66,9 @@ def test_is_one_at_corners_and_negative_beyond_a_face():
         assert barycentric(beyond, tet)[i] < 0
 
 
-@pytest.mark.parametrize("tet", [np.zeros((4, 3)), np.eye(4, 3), np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])])
+@pytest.mark.parametrize(
+    "tet", [np.zeros((4, 3)), np.eye(4, 3), np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])]
+)
 def test_degenerate_tet_is_guarded(tet):
     tet = jnp.asarray(tet, jnp.float32).at[:, 2].set(0)  # all in one plane
 

@@ -25,7 +25,9 @@ def random_directions(rng):
 
 def test_ray_frame_is_right_handed_and_orthonormal(rng):
     directions = random_directions(rng)
-    frame = np.stack([np.stack(np.broadcast_arrays(*axis), axis=-1) for axis in ray_frame(columns(directions))], axis=1)
+    frame = np.stack(
+        [np.stack(np.broadcast_arrays(*axis), axis=-1) for axis in ray_frame(columns(directions))], axis=1
+    )
     assert_allclose(frame @ frame.transpose(0, 2, 1), np.broadcast_to(np.eye(3), frame.shape), atol=1e-6)
     assert_allclose(np.linalg.det(frame), 1, atol=1e-6)
     assert_allclose(frame[:, 2], directions, atol=1e-7)
@@ -61,25 +63,35 @@ def test_agrees_with_the_sign_of_the_area(rng):
 @pytest.mark.parametrize("shift", [(0, 0), (1, 0), (0, 1), (-1, 1), (1, 2), (-1, -1)])
 def test_a_fan_is_hit_once_even_through_its_edges_and_centre(shift):
     """Triangles around a vertex cover their union exactly once, wherever the ray (the origin) meets it."""
-    ring = np.array([(2, 0), (2, 2), (0, 2), (-2, 2), (-2, 0), (-2, -2), (0, -2), (2, -2)], np.float32) + shift
+    ring = (
+        np.array([(2, 0), (2, 2), (0, 2), (-2, 2), (-2, 0), (-2, -2), (0, -2), (2, -2)], np.float32) + shift
+    )
     centre = np.array(shift, np.float32)
     hits = 0
     for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
         triangle = (centre, a, b)
-        sides = [bool(passes_left(tuple(p), tuple(q))) for p, q in zip(triangle, triangle[1:] + triangle[:1], strict=True)]
+        sides = [
+            bool(passes_left(tuple(p), tuple(q)))
+            for p, q in zip(triangle, triangle[1:] + triangle[:1], strict=True)
+        ]
         hits += all(sides)
     assert hits == 1
 
 
 def test_face_weights_reproduce_the_origin(rng):
     triangles = rng.normal(size=(300, 3, 2))
-    crosses = triangles[:, [0, 1, 2], 0] * triangles[:, [1, 2, 0], 1] - triangles[:, [0, 1, 2], 1] * triangles[:, [1, 2, 0], 0]
+    crosses = (
+        triangles[:, [0, 1, 2], 0] * triangles[:, [1, 2, 0], 1]
+        - triangles[:, [0, 1, 2], 1] * triangles[:, [1, 2, 0], 0]
+    )
     inside = np.all(crosses > 0.05, axis=1) | np.all(crosses < -0.05, axis=1)
     assert inside.sum() > 20
     triangles = triangles[inside]
     weights = np.stack(face_weights(*(columns(triangles[:, i]) for i in range(3))), axis=-1)
     assert_allclose(weights.sum(axis=1), 1, atol=1e-6)
-    assert_allclose(np.sum(weights[..., None] * triangles, axis=1), 0, atol=1e-5)  # float32, coordinates up to 3
+    assert_allclose(
+        np.sum(weights[..., None] * triangles, axis=1), 0, atol=1e-5
+    )  # float32, coordinates up to 3
 
 
 def test_face_weights_stay_in_range_and_guard_edge_on_faces():

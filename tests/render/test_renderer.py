@@ -42,7 +42,7 @@ def mlp(layers, x):
 
 
 def render_loop(impostor, config, origin, direction):
-    """One ray in plain loops: brute-force segments, equal steps in barycentric measure, the oracles' field."""
+    """One ray in plain loops: brute-force segments, equal barycentric steps, the oracles' field."""
     vertices, tets = local_vertices(impostor.mesh)
     segments = oracles.ray_segments(vertices, tets, origin, direction)
     extents = np.array([np.abs(s[4] - s[3]).sum() for s in segments])
@@ -58,7 +58,11 @@ def render_loop(impostor, config, origin, direction):
         share = (position - (ends[k] - extents[k])) / extents[k]
         low, high, tet, enter, leave = segments[k]
         point = oracles.encode(
-            impostor.tables.features, impostor.tables.layout, impostor.config.encoding, tet, enter + share * (leave - enter)
+            impostor.tables.features,
+            impostor.tables.layout,
+            impostor.config.encoding,
+            tet,
+            enter + share * (leave - enter),
         )
         sigmas.append(np.exp(mlp(impostor.decoders["density"], point)[0]))
         colors.append(logistic(mlp(impostor.decoders["appearance"], np.append(point, view))))
@@ -68,9 +72,8 @@ def render_loop(impostor, config, origin, direction):
     return weights @ np.array(colors), opacity, weights @ np.array(ts) / opacity * float(impostor.mesh.scale)
 
 
-@pytest.mark.parametrize("name", ["cube", "blobs"])
-def test_agrees_with_a_loop_over_samples(name, x64):
-    impostor = scenes.impostor(name, "float64")
+def test_agrees_with_a_loop_over_samples(x64):
+    impostor = scenes.impostor("blobs", "float64")
     config = dataclasses.replace(
         exact(max_samples_per_ray=64),
         march=dataclasses.replace(RENDER.march, max_tets_per_ray=24, max_entries_per_ray=3),
@@ -94,10 +97,6 @@ def test_rays_that_miss_are_exactly_transparent():
     output = render(impostor, as_rays(rays_at(impostor, missing)), RENDER)
     for value in (output.color, output.opacity, output.depth):
         assert_array_equal(value, np.zeros_like(value))
-    gradient = jax.grad(lambda v: jnp.sum(render(
-        impostor.replace(mesh=impostor.mesh.replace(vertices=v)), as_rays(rays_at(impostor, missing)), RENDER
-    ).color))(impostor.mesh.vertices)  # fmt: skip
-    assert_array_equal(gradient, np.zeros_like(gradient))
 
 
 @pytest.mark.parametrize("measure", ["barycentric", "euclidean"])
@@ -116,15 +115,6 @@ def test_constant_density_has_the_analytic_opacity(measure, x64):
         else:
             total = sum(s[1] - s[0] for s in segments)
         assert_allclose(output.opacity[ray], -np.expm1(-np.exp(bias) * total), atol=1e-10)
-
-
-def test_euclidean_density_with_barycentric_steps_is_close():
-    impostor = constant_density(scenes.impostor(), 0.5)
-    rays = as_rays(rays_at(impostor))
-    same = render(impostor, rays, exact(measure="euclidean", density_measure="euclidean", step=0.1))
-    mixed = render(impostor, rays, exact(density_measure="euclidean", step=0.05, max_samples_per_ray=128))
-    # steps that straddle two tets count for one: an error of the order of a step
-    assert_allclose(mixed.opacity, same.opacity, atol=0.02)
 
 
 def flatten(tree):
@@ -184,15 +174,12 @@ def test_camera_gradient_matches_finite_differences(x64):
     check_directions(lambda m: objective(impostor, m), camera.camera_to_world, by_matrix)
 
 
-def test_gradients_of_an_opaque_scene_are_finite():
-    impostor = constant_density(scenes.impostor(), 39.0)
-
-    def total(impostor):
-        output = render_rays(impostor, as_rays(rays_at(impostor)), RENDER)
-        return jnp.sum(output.color) + jnp.sum(output.opacity) + jnp.sum(output.depth)
-
-    gradient = jax.jit(jax.grad(total, allow_int=True))(impostor)
-    for leaf in jax.tree.leaves(gradient):
+def test_gradients_of_an_opaque_scene_are_finite(x64):
+    impostor, camera, _, gradient = gradient_scene()
+    opaque = constant_density(impostor, 39.0)
+    by_impostor, by_matrix = gradient(opaque, camera.camera_to_world)
+    assert np.all(np.isfinite(by_matrix))
+    for leaf in jax.tree.leaves(by_impostor):
         if jnp.issubdtype(leaf.dtype, jnp.floating):
             assert np.all(np.isfinite(leaf))
 
@@ -211,7 +198,9 @@ def test_a_rigid_motion_of_cage_and_camera_changes_nothing(x64):
     origins, directions = rays_at(impostor)
     mesh = impostor.mesh
     moved = impostor.replace(
-        mesh=mesh.replace(vertices=mesh.vertices @ q.T, center=jnp.asarray(q @ np.asarray(mesh.center) + shift))
+        mesh=mesh.replace(
+            vertices=mesh.vertices @ q.T, center=jnp.asarray(q @ np.asarray(mesh.center) + shift)
+        )
     )
     before = render(impostor, as_rays((origins, directions), "float64"), config)
     after = render(moved, as_rays((origins @ q.T + shift, directions @ q.T), "float64"), config)
@@ -270,10 +259,11 @@ def test_invisible_samples_may_be_left_out():
 def test_overflow_and_coarsening_reach_the_output():
     impostor = scenes.impostor()
     rays = as_rays(rays_at(impostor))
-    few = render(impostor, rays, dataclasses.replace(RENDER, march=dataclasses.replace(RENDER.march, max_tets_per_ray=1)))
-    assert np.any(few.overflow)
-    assert np.any(render(impostor, rays, exact(capacity_per_ray=1)).overflow)
-    assert np.any(render(impostor, rays, exact(max_samples_per_ray=2)).coarsened)
+    march = dataclasses.replace(RENDER.march, max_tets_per_ray=1)
+    assert np.any(render(impostor, rays, dataclasses.replace(RENDER, march=march)).overflow)
+    crowded = render(impostor, rays, exact(max_samples_per_ray=3, capacity_per_ray=2))
+    assert np.any(crowded.overflow)
+    assert np.any(crowded.coarsened)
     good = render(impostor, rays, RENDER)
     assert not np.any(good.overflow | good.coarsened)
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -117,7 +118,9 @@ def test_measures_match_the_oracle():
         length = sum(s[1] - s[0] for s in expected)
         assert_allclose(np.sum(segment_measure(segments, "barycentric")[ray]), bary, atol=1e-4)
         assert_allclose(np.sum(segment_measure(segments, "euclidean")[ray]), length, atol=1e-4)
-        assert np.sum(segment_measure(segments, "alpha")[ray]) == np.sum(np.asarray(segments.tet_ids)[ray] >= 0)
+        assert np.sum(segment_measure(segments, "alpha")[ray]) == np.sum(
+            np.asarray(segments.tet_ids)[ray] >= 0
+        )
 
 
 def test_a_mixed_density_measure_converges_to_the_rays_measure():
@@ -136,7 +139,9 @@ def test_equal_steps_no_longer_than_asked_for_and_samples_in_their_middle():
     assert_allclose(points["deltas"], [0.5] * 7, atol=1e-6)
     assert_allclose(points["t"], [1.25, 1.75, 2.25, 0.25, 0.75, 1.25, 1.75], atol=1e-6)
     assert_array_equal(points["tet_ids"], [5, 5, 5, 2, 2, 2, 2])
-    points = used(sample(segments_of([(0, 0.0, 1.2)]), dataclasses.replace(CONFIG, measure="euclidean"), "euclidean"))
+    points = used(
+        sample(segments_of([(0, 0.0, 1.2)]), dataclasses.replace(CONFIG, measure="euclidean"), "euclidean")
+    )
     assert_allclose(points["deltas"], [0.4] * 3, atol=1e-6)
 
 
@@ -191,7 +196,7 @@ def test_jitter_at_its_largest_stays_in_the_ray(rng):
     rays = []
     for _ in range(400):
         cuts = np.cumsum(rng.uniform(0.01, 0.3, 4))
-        rays.append([(9, low, high) for low, high in zip(cuts, cuts[1:], strict=False)])
+        rays.append([(9, low, high) for low, high in itertools.pairwise(cuts)])
     segments = segments_of(*rays, slots=16)
     largest = np.nextafter(np.float32(1), np.float32(0))
     for step in (3.0, 0.7):

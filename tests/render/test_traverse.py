@@ -121,7 +121,7 @@ def test_degenerate_rays_lose_nothing(name, dtype, kind, x64):
 
 
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_rays_through_vertices_never_leave_their_line(dtype, x64):
+def test_rays_through_vertices_never_leave_their_line(dtype, x64, optimized):
     """Many, through the vertices of a cage that is not convex: they leave and re-enter it at a vertex.
 
     If kernels rounded a vertex's projection differently (fused multiply-adds), about 1 in 500 would derail.
@@ -129,7 +129,9 @@ def test_rays_through_vertices_never_leave_their_line(dtype, x64):
     mesh = tet_mesh("nonconvex", dtype)
     vertices, tets = local_vertices(mesh)
     origins, directions = DEGENERATE["through_vertices"](vertices, tets, np.random.default_rng(7), 4096)
-    segments = walk(mesh, as_rays((origins, directions), dtype))
+    segments = jax.jit(walk.__wrapped__, static_argnames="config")(
+        mesh, as_rays((origins, directions), dtype)
+    )
     used = np.asarray(segments.tet_ids) >= 0
     corners = vertices[tets[np.maximum(segments.tet_ids, 0)]]
     for t, weights in ((segments.t_enter, segments.lambda_enter), (segments.t_exit, segments.lambda_exit)):
@@ -143,7 +145,9 @@ def test_lattice_rays_through_vertices_and_faces_of_a_cube():
     vertices, tets = cube()
     mesh = build_tet_mesh(vertices, tets)
     mesh = mesh.replace(vertices=jnp.asarray(vertices, jnp.float32))
-    origins = np.array([[-1, 0.5, 0.5], [0.5, 0.5, -2], [0.5, 3, 0.5], [-1, -1, -1], [-1, 0.5, -1], [-1, 0.25, 0.75]])
+    origins = np.array(
+        [[-1, 0.5, 0.5], [0.5, 0.5, -2], [0.5, 3, 0.5], [-1, -1, -1], [-1, 0.5, -1], [-1, 0.25, 0.75]]
+    )
     directions = unit(np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0], [1, 1, 1], [1, 0, 1], [1, 0, 0]]))
     segments = walk(mesh, as_rays((origins, directions)))
     chords = np.sum(np.asarray(segments.t_exit - segments.t_enter), axis=1)
@@ -151,7 +155,7 @@ def test_lattice_rays_through_vertices_and_faces_of_a_cube():
 
 
 def test_parallel_rays_over_a_cubes_silhouette_count_it_once(rng):
-    """Rays through a whole lattice, its border included: the half-open silhouette has exactly n x n of them."""
+    """Rays through a lattice, its border included: the half-open silhouette has exactly n x n of them."""
     vertices, tets = cube()
     mesh = build_tet_mesh(vertices, tets).replace(vertices=jnp.asarray(vertices, jnp.float32))
     n = 8
@@ -226,12 +230,16 @@ def test_too_few_entries_are_reported_and_hold_the_first_runs(rng):
 def test_overlapping_bodies_both_count(rng):
     """Two copies of a mesh in the same place (Fig. 4, intersecting): both bodies' tets are crossed."""
     vertices, tets = delaunay(count=12)
-    mesh = build_tet_mesh(np.concatenate([vertices, vertices + 0.3]), np.concatenate([tets, tets + len(vertices)]))
+    mesh = build_tet_mesh(
+        np.concatenate([vertices, vertices + 0.3]), np.concatenate([tets, tets + len(vertices)])
+    )
     rays = generic(*local_vertices(mesh), rng, COUNT)
     segments = walk(mesh, as_rays(rays))
     for ray, (origin, direction) in enumerate(zip(*rays, strict=True)):
         expected = sum(s[1] - s[0] for s in oracles.ray_segments(*local_vertices(mesh), origin, direction))
-        assert_allclose(np.sum(row(segments, ray)[2] - row(segments, ray)[1]), expected, atol=TOLERANCE["float32"])
+        assert_allclose(
+            np.sum(row(segments, ray)[2] - row(segments, ray)[1]), expected, atol=TOLERANCE["float32"]
+        )
 
 
 @pytest.mark.parametrize("tile", [1, 7, None])
@@ -253,7 +261,6 @@ def test_no_rays_give_no_segments():
 def test_far_away_rays_find_a_small_cage(rng):
     """Culling by cones must not lose faces where the cage is a speck."""
     mesh = tet_mesh("cube")
-    vertices, tets = local_vertices(mesh)
     targets = rng.uniform(-0.4, 0.4, (COUNT, 3))
     directions = unit(rng.normal(size=(COUNT, 3)))
     rays = as_rays((targets - 200 * directions, directions))
@@ -263,7 +270,7 @@ def test_far_away_rays_find_a_small_cage(rng):
 
 def test_moved_vertices_are_walked_with_fresh_tables(rng):
     mesh = tet_mesh("nonconvex", "float32")
-    vertices, tets = local_vertices(mesh)
+    vertices, _ = local_vertices(mesh)
     angle = 0.7 * vertices[:, 2]
     twisted = vertices.copy()
     twisted[:, 0] = np.cos(angle) * vertices[:, 0] - np.sin(angle) * vertices[:, 1]
@@ -323,7 +330,9 @@ def test_ends_are_differentiable_in_vertices_and_rays(x64, rng):
     def function(x):
         moved = mesh.replace(vertices=mesh.vertices + x[:8])
         bent = rays.replace(origins=rays.origins + x[8:14], directions=rays.directions + x[14:])
-        bent = bent.replace(directions=bent.directions / jnp.linalg.norm(bent.directions, axis=1, keepdims=True))
+        bent = bent.replace(
+            directions=bent.directions / jnp.linalg.norm(bent.directions, axis=1, keepdims=True)
+        )
         segments = walk(moved, bent)
         ends = segments.lambda_enter + 0.5 * segments.lambda_exit
         ends += (segments.t_enter - 2 * segments.t_exit)[..., None]

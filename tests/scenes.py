@@ -35,7 +35,9 @@ def exact(**changes):
     """RENDER with changes, of the sampler too (`step`, `measure`, ...)."""
     names = {f.name for f in dataclasses.fields(SamplerConfig)}
     sampler = dataclasses.replace(RENDER.sampler, **{k: v for k, v in changes.items() if k in names})
-    return dataclasses.replace(RENDER, sampler=sampler, **{k: v for k, v in changes.items() if k not in names})
+    return dataclasses.replace(
+        RENDER, sampler=sampler, **{k: v for k, v in changes.items() if k not in names}
+    )
 
 
 def impostor(name="cube", dtype="float32", scale=1.0, offset=0.0, seed=0):
@@ -46,6 +48,7 @@ def impostor(name="cube", dtype="float32", scale=1.0, offset=0.0, seed=0):
     rng = np.random.default_rng(seed)
     features = tuple(jnp.asarray(rng.normal(size=f.shape), dtype) for f in made.tables.features)
     decoders = jax.tree.map(lambda x: jnp.asarray(0.7 * rng.normal(size=x.shape), dtype), made.decoders)
+    decoders["density"][-1]["bias"] -= 1.5  # most rays neither empty nor opaque
     return made.replace(tables=made.tables.replace(features=features), decoders=decoders)
 
 

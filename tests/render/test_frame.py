@@ -1,0 +1,163 @@
+"""render.frame and render.capacity: whole images, buffer sizes from the scene, repair of overflow."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+import scenes
+from meshes import local_vertices, tet_mesh
+from numpy.testing import assert_allclose, assert_array_equal
+from rays import as_rays, generic, missing
+from scenes import RENDER, exact
+
+from nimpostor_jax.config import MarchConfig
+from nimpostor_jax.render import capacity
+from nimpostor_jax.render import frame as frames
+from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
+from nimpostor_jax.render.capacity import fit_capacities, rays_hit
+from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.traverse import march_tables, traverse
+
+render = jax.jit(render_rays, static_argnames="config")
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """Several chunks in a small image, on one device: every device compiles anew."""
+    monkeypatch.setattr(frames, "CHUNK", 64)
+    monkeypatch.setattr(frames, "REPAIR_CHUNK", 64)
+    devices = jax.local_devices()[:1]
+    monkeypatch.setattr(jax, "local_devices", lambda: devices)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return scenes.impostor(), scenes.camera(20, 18)
+
+
+def whole_image(impostor, camera, config):
+    rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2))
+    output = render(impostor, rays, config)
+    shape = (camera.height, camera.width)
+    return {
+        name: np.asarray(getattr(output, name)).reshape(*shape, -1).squeeze() for name in frames.Frame._fields
+    }
+
+
+def check_equal(frame, expected):
+    for name, value in expected.items():
+        assert getattr(frame, name).shape == value.shape
+        assert_allclose(getattr(frame, name), value, atol=1e-5)  # other programs, float32 depths of about 3
+
+
+def test_a_frame_is_the_picture_of_its_rays(scene, monkeypatch):
+    devices = jax.devices()
+    assert len(devices) == 2
+    monkeypatch.setattr(jax, "local_devices", lambda: devices)  # the chunks take turns
+    impostor, camera = scene
+    expected = whole_image(impostor, camera, RENDER)
+    frame = render_frame(impostor, camera, RENDER)
+    check_equal(frame, expected)
+    covered = expected["opacity"] > 0
+    assert 128 < covered.sum() < covered.size  # several chunks, and some background
+
+
+def test_overflow_is_repaired(scene):
+    impostor, camera = scene
+    expected = whole_image(impostor, camera, RENDER)
+    config = exact(capacity_per_ray=2)
+    config = dataclasses.replace(config, march=MarchConfig(max_tets_per_ray=3, max_entries_per_ray=2))
+    check_equal(render_frame(impostor, camera, config), expected)
+
+
+def test_what_cannot_be_repaired_is_an_error_and_no_picture(scene, monkeypatch):
+    monkeypatch.setattr(frames, "MAX_GROWTH", 0)
+    impostor, camera = scene
+    config = dataclasses.replace(RENDER, march=MarchConfig(max_tets_per_ray=2, max_entries_per_ray=1))
+    with pytest.raises(RuntimeError, match="MarchConfig"):
+        render_frame(impostor, camera, config)
+
+
+def test_a_camera_that_sees_nothing_gives_an_empty_frame(scene):
+    impostor, _ = scene
+    away = scenes.camera(8, 8, position=(9.0, 9.0, 9.0), target=(20.0, 20.0, 20.0))
+    # lines count as hits, whichever way they are followed: look past the cage instead
+    aside = away.replace(camera_to_world=scenes.look_at((9.0, 0.0, 0.0), (9.0, 30.0, 1.0)))
+    for camera in (away, aside):
+        frame = render_frame(impostor, camera, RENDER)
+        assert_array_equal(frame.opacity, np.zeros((8, 8)))
+        assert_array_equal(to_image(frame, 1.0), np.ones((8, 8, 3)))
+    assert frame_config(impostor, aside, RENDER) == RENDER
+
+
+def test_frame_config_fits_and_spares(scene):
+    impostor, camera = scene
+    generous = dataclasses.replace(RENDER, march=MarchConfig(max_tets_per_ray=64, max_entries_per_ray=2))
+    config = frame_config(impostor, camera, generous)
+    assert config.march.max_tets_per_ray < 64
+    assert config.sampler.capacity_per_ray <= config.sampler.max_samples_per_ray <= 16
+    check_equal(render_frame(impostor, camera, config), whole_image(impostor, camera, RENDER))
+
+
+def test_to_image_blends_and_clips():
+    frame = frames.Frame(
+        color=np.array([[[0.2, 0.1, 0.0], [2.0, 0.0, 0.0]]]),
+        opacity=np.array([[0.5, 1.0]]),
+        depth=np.zeros((1, 2)),
+        coarsened=np.zeros((1, 2), bool),
+    )
+    assert_allclose(to_image(frame, np.array([1.0, 0.0, 0.5])), [[[0.7, 0.1, 0.25], [1, 0, 0]]])
+
+
+def sample_rays(mesh, kind, count=48):
+    rays = kind(*local_vertices(mesh), np.random.default_rng(0), count)
+    origins = np.asarray(mesh.center) + float(mesh.scale) * rays[0]
+    return as_rays((origins, rays[1]))
+
+
+def test_rays_hit_says_which_lines_meet_the_cage():
+    mesh = tet_mesh("blobs")
+    tables = march_tables(mesh)
+    assert np.all(rays_hit(mesh, tables, sample_rays(mesh, generic), RENDER.march))
+    assert not np.any(rays_hit(mesh, tables, sample_rays(mesh, missing), RENDER.march))
+
+
+def test_fitted_buffers_hold_the_rays_they_were_measured_on():
+    impostor = scenes.impostor("blobs")
+    rays = sample_rays(impostor.mesh, generic)
+    config = dataclasses.replace(
+        exact(max_samples_per_ray=64), march=MarchConfig(max_tets_per_ray=16, max_entries_per_ray=2)
+    )
+    fitted = fit_capacities(impostor.mesh, march_tables(impostor.mesh), rays, config)
+    output = render(impostor, rays, fitted)
+    assert not np.any(output.overflow)
+    assert not np.any(output.coarsened)
+    assert fitted.sampler.capacity_per_ray < 64
+
+
+@pytest.mark.parametrize("growth", [1, 2])
+def test_growth_is_tried_to_its_end_and_then_an_error(growth, monkeypatch):
+    """Slots of a quarter of the need have to be doubled twice; once does not suffice."""
+    mesh = tet_mesh("delaunay")
+    tables, rays = march_tables(mesh), sample_rays(mesh, generic)
+    needed = int(
+        np.max(np.sum(np.asarray(traverse(tables, to_local(mesh, rays), MarchConfig()).codes) >= 0, axis=1))
+    )
+    start = -(-needed // 4)
+    config = dataclasses.replace(
+        exact(max_samples_per_ray=64), march=MarchConfig(max_tets_per_ray=start, max_entries_per_ray=1)
+    )
+    monkeypatch.setattr(capacity, "MAX_GROWTH", growth)
+    if growth == 2:
+        assert fit_capacities(mesh, tables, rays, config).march.max_tets_per_ray >= needed
+    else:
+        with pytest.raises(ValueError, match=f"more than {2 * start} tets"):
+            fit_capacities(mesh, tables, rays, config)
+
+
+def test_rays_that_miss_need_no_more_than_the_least():
+    mesh = tet_mesh("cube")
+    fitted = fit_capacities(mesh, march_tables(mesh), sample_rays(mesh, missing), RENDER)
+    assert fitted.sampler.capacity_per_ray >= 1

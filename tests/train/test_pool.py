@@ -1,0 +1,113 @@
+"""train.pool: which pixels are trained on, and how batches are drawn."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from meshes import tet_mesh
+from numpy.testing import assert_allclose, assert_array_equal
+from scenes import RENDER
+
+from nimpostor_jax.render.camera import pixel_rays
+from nimpostor_jax.render.capacity import rays_hit
+from nimpostor_jax.render.traverse import march_tables
+from nimpostor_jax.train.pool import build_pool, draw_batch
+
+WIDTH, HEIGHT = 14, 10
+
+
+@pytest.fixture(scope="module")
+def views():
+    """Three views of a cube: colours say view, x and y; alpha is 1 in a small middle part."""
+    cameras = [scenes.camera(WIDTH, HEIGHT, position=p) for p in ((3, 1, 2), (-2, 1.5, 2), (0.5, -2.5, 1.0))]
+    images = np.zeros((3, HEIGHT, WIDTH, 4), np.float32)
+    images[..., 0] = np.arange(3)[:, None, None] / 10
+    images[..., 1] = np.arange(HEIGHT)[:, None] / 100
+    images[..., 2] = np.arange(WIDTH) / 100
+    images[:, 4:6, 6:8, 3] = 1
+    return jax.tree.map(lambda *x: jnp.stack(x), *cameras), images
+
+
+@pytest.fixture(scope="module")
+def pool(views):
+    return build_pool(tet_mesh("cube"), *views, RENDER.march)
+
+
+def test_the_pool_holds_the_pixels_that_hit_the_cage(pool, views):
+    pixels, missed = pool
+    cameras, images = views
+    count = len(pixels.views)
+    assert 0 < count < images[..., 0].size
+    assert missed == 0
+    assert len(np.unique(np.column_stack([pixels.views, pixels.pixels]), axis=0)) == count
+    x, y = np.asarray(pixels.pixels).T
+    assert_array_equal(pixels.colors, images[np.asarray(pixels.views), y, x])
+    mesh = tet_mesh("cube")
+    of_each = jax.tree.map(lambda leaf: leaf[pixels.views], cameras)
+    rays = pixel_rays(of_each, pixels.pixels + 0.5)
+    assert np.all(rays_hit(mesh, march_tables(mesh), rays, RENDER.march))
+
+
+def test_foreground_outside_the_cage_is_counted(views):
+    cameras, images = views
+    solid = images.copy()
+    solid[..., 3] = 0
+    solid[0, 0, 0, 3] = solid[0, 5, 7, 3] = 1  # a corner of the picture misses, the middle hits
+    _, missed = build_pool(tet_mesh("cube"), cameras, solid, RENDER.march)
+    assert missed == 0.5
+
+
+def test_cameras_that_miss_the_cage_are_an_error(views):
+    cameras, images = views
+    elsewhere = dataclasses.replace(cameras, camera_to_world=cameras.camera_to_world.at[:, :3, 3].add(100.0))
+    with pytest.raises(ValueError, match="hits the cage"):
+        build_pool(tet_mesh("cube"), elsewhere, images, RENDER.march)
+
+
+def test_a_batch_is_a_function_of_key_and_step(pool):
+    pixels, key = pool[0], jax.random.key(0)
+    batch = draw_batch(key, 3, pixels, 40, "random")
+    for a, b in zip(
+        jax.tree.leaves(batch),
+        jax.tree.leaves(draw_batch(key, jnp.asarray(3), pixels, 40, "random")),
+        strict=True,
+    ):
+        assert_array_equal(a, b)
+    for other in (
+        draw_batch(key, 4, pixels, 40, "random"),
+        draw_batch(jax.random.key(1), 3, pixels, 40, "random"),
+    ):
+        assert np.mean(np.asarray(other.target[:, :3] == batch.target[:, :3]).all(axis=1)) < 0.5
+        assert not np.any(np.asarray(other.jitter) == np.asarray(batch.jitter))
+
+
+def test_a_batchs_rays_belong_to_its_targets(pool, views):
+    pixels, _ = pool
+    cameras, _ = views
+    batch = draw_batch(jax.random.key(0), 0, pixels, 60, "white")
+    colors = np.asarray(batch.target)
+    view, y, x = (np.round(colors[:, i] * s).astype(int) for i, s in ((0, 10), (1, 100), (2, 100)))
+    expected = pixel_rays(
+        jax.tree.map(lambda leaf: leaf[view], cameras), jnp.asarray(np.stack([x, y], 1) + 0.5, jnp.float32)
+    )
+    assert_allclose(batch.rays.origins, expected.origins, atol=1e-6)
+    assert_allclose(batch.rays.directions, expected.directions, atol=1e-6)
+    assert np.all((batch.jitter >= 0) & (batch.jitter < 1))
+    assert len(np.unique(view)) == 3
+
+
+@pytest.mark.parametrize("background, value", [("white", 1.0), ("black", 0.0)])
+def test_plain_backgrounds(pool, background, value):
+    assert_array_equal(
+        draw_batch(jax.random.key(0), 0, pool[0], 8, background).background, np.full((8, 3), value)
+    )
+
+
+def test_random_backgrounds_cover_the_range(pool):
+    colors = np.asarray(draw_batch(jax.random.key(0), 0, pool[0], 400, "random").background)
+    assert colors.shape == (400, 3)
+    assert colors.min() < 0.05
+    assert colors.max() > 0.95

@@ -1,0 +1,171 @@
+"""train.step, train.losses and train.sharding: one step, on one and on two devices."""
+
+import dataclasses
+import functools
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from meshes import local_vertices
+from numpy.testing import assert_allclose, assert_array_equal
+from rays import as_rays, generic
+from scenes import FIELD, RENDER
+
+from nimpostor_jax.config import TrainConfig
+from nimpostor_jax.field.impostor import init_impostor
+from nimpostor_jax.render.camera import to_local
+from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.traverse import march_tables, traverse
+from nimpostor_jax.train.losses import photometric
+from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.step import (
+    RayBatch,
+    init_state,
+    learning_rate,
+    loss_gradient,
+    make_optimizer,
+    train_step,
+    trainable,
+    with_parameters,
+)
+
+COUNT = 32
+OPTIMIZER = make_optimizer()
+RATE = jnp.asarray(2e-2)
+
+
+@functools.cache
+def scene():
+    """An untrained impostor and a batch: the cage seen from outside as solid colour by direction."""
+    impostor = init_impostor(jax.random.key(3), scenes.impostor().mesh, FIELD)
+    rng = np.random.default_rng(0)
+    origins, directions = generic(*local_vertices(impostor.mesh), rng, COUNT)
+    world = np.asarray(impostor.mesh.center) + float(impostor.mesh.scale) * origins
+    color = 0.5 + 0.4 * directions
+    batch = RayBatch(
+        rays=as_rays((world, directions)),
+        target=jnp.asarray(np.column_stack([color, np.ones(COUNT)]), jnp.float32),
+        background=jnp.asarray(rng.uniform(size=(COUNT, 3)), jnp.float32),
+        jitter=jnp.asarray(rng.uniform(size=COUNT), jnp.float32),
+    )
+    return impostor, batch
+
+
+@functools.cache
+def stepper(gradient=loss_gradient):
+    """The jitted step; a second trace is an error."""
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def step(state, impostor, batch, rate):
+        return train_step(state, impostor, batch, rate, config=RENDER, optimizer=OPTIMIZER, gradient=gradient)
+
+    return step
+
+
+def run(steps):
+    impostor, batch = scene()
+    state, losses = init_state(impostor, OPTIMIZER), []
+    for _ in range(steps):
+        state, metrics = stepper()(state, impostor, batch, RATE)
+        losses.append(float(metrics["loss"]))
+    return state, losses
+
+
+def test_loss_falls_and_the_step_compiles_once():
+    """`stepper` raises at a second trace."""
+    _, losses = run(40)
+    assert losses[-1] < 0.5 * losses[0]
+    assert np.all(np.isfinite(losses))
+
+
+def test_steps_are_deterministic_and_counted():
+    first, _ = run(2)
+    again, _ = run(2)
+    assert int(first.step) == 2
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
+        assert_array_equal(a, b)
+
+
+def test_every_parameter_group_is_trained():
+    impostor, _ = scene()
+    state, _ = run(2)
+    before = trainable(impostor)
+    for name in ("features", "decoders"):
+        for old, new in zip(
+            jax.tree.leaves(before[name]), jax.tree.leaves(state.parameters[name]), strict=True
+        ):
+            assert np.any(np.asarray(old) != np.asarray(new))
+
+
+def test_two_devices_give_the_step_of_one():
+    impostor, batch = scene()
+    mesh = device_mesh(jax.devices()[:2])
+    assert mesh.size == 2
+    state = init_state(impostor, OPTIMIZER)
+    single, single_metrics = stepper()(state, impostor, batch, RATE)
+    placed, shared = jax.device_put((state, impostor), replicated(mesh))
+    split = jax.device_put(batch, over_rays(mesh))
+    double, double_metrics = stepper(data_parallel(mesh))(placed, shared, split, RATE)
+    for name, value in single_metrics.items():
+        assert_allclose(double_metrics[name], value, rtol=1e-5)
+    # Adam's first step is the gradient's sign times the rate: compare what it is made of, the first moments,
+    # which are sums over rays in another order.
+    for a, b in zip(jax.tree.leaves(single.optimizer), jax.tree.leaves(double.optimizer), strict=True):
+        assert_allclose(b, a, rtol=1e-4, atol=1e-7)
+
+
+def test_the_loss_is_that_of_the_blended_colours():
+    color = jnp.array([[1.0, 0, 0], [0, 0, 0], [9, 9, 9]])
+    target = jnp.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 0]])
+    assert_allclose(photometric(color, target, jnp.array([False, False, False])), (1 + 1 + 243) / 9)
+    assert_allclose(photometric(color, target, jnp.array([False, False, True])), 2 / 9)
+
+
+def test_a_perfect_target_has_no_loss():
+    impostor, batch = scene()
+    output = jax.jit(render_rays, static_argnames="config")(impostor, batch.rays, RENDER, batch.jitter)
+    target = jnp.column_stack([output.color, output.opacity])
+    _, metrics = stepper()(
+        init_state(impostor, OPTIMIZER), impostor, dataclasses.replace(batch, target=target), RATE
+    )
+    assert metrics["loss"] < 1e-10  # float32 roundings, squared
+
+
+def test_overflowed_rays_are_ignored_and_reported():
+    """A ray that does not fit must not teach: its target changes neither loss nor gradient."""
+    impostor, batch = scene()
+    config = dataclasses.replace(RENDER, march=dataclasses.replace(RENDER.march, max_tets_per_ray=3))
+    march = jax.jit(traverse, static_argnames="config")
+    local = to_local(impostor.mesh, batch.rays)
+    lost = np.asarray(march(march_tables(impostor.mesh), local, config.march).overflow)
+    assert 0 < lost.sum() < COUNT
+    gradient = jax.jit(loss_gradient, static_argnames="config")
+    other = dataclasses.replace(batch, target=jnp.where(lost[:, None], 7.0, batch.target))
+    slope, metrics = gradient(trainable(impostor), impostor, batch, config=config)
+    other_slope, other_metrics = gradient(trainable(impostor), impostor, other, config=config)
+    assert_allclose(metrics["overflow"], lost.mean())
+    assert metrics["loss"] == other_metrics["loss"]
+    for a, b in zip(jax.tree.leaves(slope), jax.tree.leaves(other_slope), strict=True):
+        assert_array_equal(a, b)
+
+
+def test_parameters_go_out_and_in():
+    impostor, _ = scene()
+    parameters = jax.tree.map(lambda x: x + 1, trainable(impostor))
+    changed = with_parameters(impostor, parameters)
+    for a, b in zip(jax.tree.leaves(trainable(changed)), jax.tree.leaves(parameters), strict=True):
+        assert_array_equal(a, b)
+    assert changed.mesh is impostor.mesh
+
+
+def test_learning_rate_warms_up_and_decays():
+    config = TrainConfig(learning_rate=1e-2, final_learning_rate=1e-4, warmup_steps=9)
+    assert learning_rate(config, 0.0, 0) == pytest.approx(1e-3)
+    assert learning_rate(config, 0.0, 9) == pytest.approx(1e-2)
+    assert learning_rate(config, 0.5, 500) == pytest.approx(1e-3)
+    assert learning_rate(config, 1.0, 1000) == pytest.approx(1e-4)
+    assert learning_rate(config, 7.0, 1000) == pytest.approx(1e-4)
