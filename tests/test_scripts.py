@@ -76,7 +76,9 @@ def test_bad_input_ends_in_one_line(script, arguments, message, tmp_path):
     assert not workdir.exists()
 
 
-@pytest.mark.parametrize("script", ["train.py", "evaluate.py", "render.py", "make_cage.py", "benchmark.py", "demo.py"])
+@pytest.mark.parametrize(
+    "script", ["train.py", "evaluate.py", "render.py", "make_cage.py", "benchmark.py", "demo.py"]
+)
 def test_help_says_what_there_is(script):
     done = run(script, "--help")
     assert done.returncode == 0

@@ -60,11 +60,14 @@ def _canonical(
     lambdas = jnp.clip(lambdas, 0, 1)
     if config.layout == "per_tet":
         return [lambdas[:, i] for i in range(4)]
+    shifts = jnp.arange(0, 8, 2)
+    packed = jnp.sum(layout.corner_order << shifts, axis=1)[tet_ids]  # four times 2 bits: one gather
     columns = []
     for i in range(4):
-        corner = layout.corner_order[:, i][tet_ids]
-        pairs = [jnp.where(corner == a + 1, lambdas[:, a + 1], lambdas[:, a]) for a in (0, 2)]
-        columns.append(jnp.where(corner >= 2, pairs[1], pairs[0]))
+        corner = (packed >> (2 * i)) & 3
+        low = jnp.where(corner == 1, lambdas[:, 1], lambdas[:, 0])
+        high = jnp.where(corner == 3, lambdas[:, 3], lambdas[:, 2])
+        columns.append(jnp.where(corner >= 2, high, low))
     return columns
 
 

@@ -7,6 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import jax
+import numpy as np
+from jaxtyping import Float, Int
 
 from nimpostor_jax.config import ExperimentConfig, RenderConfig
 from nimpostor_jax.field.impostor import init_impostor
@@ -89,9 +91,27 @@ def prepare(
     impostor = init_impostor(key, mesh, config.impostor)
     entries = [f.shape[0] for f in impostor.tables.features]
     log(f"{len(tets)} tets, {sum(entries):,} table entries in {len(entries)} levels {entries}")
+    finest = config.impostor.encoding.resolutions[-1]
+    log(f"the finest grid cell is {pixels_per_cell(vertices, tets, train, finest):.2f} pixels wide")
     probe = draw_batch(key, 0, pool, min(config.train.rays_per_batch, 8192), "white")
     render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, config.render)
     return Scene(config=config, train=train, test=test, impostor=impostor, pool=pool, render=render)
+
+
+def pixels_per_cell(
+    vertices: Float[np.ndarray, "V 3"],
+    tets: Int[np.ndarray, "T 4"],
+    views: PosedImages,
+    resolution: int,
+) -> float:
+    """Width in pixels of a grid cell of the given resolution, on the median edge at the median distance.
+
+    About 1 is right for the finest level: choose `EncodingConfig.num_levels` by it.
+    """
+    edges = vertices[tets[:, [0, 0, 0, 1, 1, 2]]] - vertices[tets[:, [1, 2, 3, 2, 3, 3]]]
+    distances = np.linalg.norm(views.camera_to_world[:, :3, 3] - vertices.mean(axis=0), axis=1)
+    pixel = np.median(distances) / np.median(views.focal)
+    return float(np.median(np.linalg.norm(edges, axis=-1)) / resolution / pixel)
 
 
 def load_cage(

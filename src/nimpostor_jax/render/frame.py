@@ -1,19 +1,21 @@
 """Whole images, in chunks of rays that hit the cage: host code around the jitted renderer."""
 
 import dataclasses
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
 from jaxtyping import Bool, Float
 
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
+from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, fit_capacities, grow_march, rays_hit
 from nimpostor_jax.render.renderer import render_rays
-from nimpostor_jax.render.traverse import march_tables
-from nimpostor_jax.types import Camera, NeuralImpostor, Rays
+from nimpostor_jax.render.traverse import MarchTables, march_tables
+from nimpostor_jax.types import Camera, NeuralImpostor, Rays, RenderOutput
 
 CHUNK = 8192  # rays a call
 REPAIR_CHUNK = 1024  # rays a call with buffers of the largest size
@@ -30,7 +32,6 @@ class Frame(NamedTuple):
 
 
 _march_tables = jax.jit(march_tables)
-_render = jax.jit(render_rays, static_argnames="config")
 
 
 @partial(jax.jit, static_argnames=("height", "width"))
@@ -58,7 +59,8 @@ def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     config = fit_capacities(impostor.mesh, tables, probe, config)
     if config.visible_per_ray is None:
         return config
-    output = _render(impostor, probe, config, tables=tables)
+    render = _Renderer(impostor, tables)
+    output = render(jax.tree.map(lambda x: np.tile(x, (render.num_devices, 1)), probe), config)
     mean = 1.25 * float(np.mean(output.num_visible)) + 1
     if mean <= config.visible_per_ray and np.mean(output.overflow) < REPAIRABLE:
         return config
@@ -71,8 +73,9 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     """Render one camera.
 
     Only pixels whose rays hit the cage are shaded, `CHUNK` at a time, so memory does not grow with the image
-    beyond its output. Rays whose buffers overflow are rendered again, fewer at a time, in larger ones; raises
-    RuntimeError where 2**6 times the given sizes do not suffice. On several devices the chunks take turns.
+    beyond its output; a chunk's rays are split over all local devices. Rays whose buffers overflow are
+    rendered again, fewer at a time, in larger ones; raises RuntimeError where 2**6 times the given sizes do
+    not suffice.
     """
     height, width = camera.height, camera.width
     tables = _march_tables(impostor.mesh)
@@ -86,16 +89,13 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
         depth=np.zeros(pixels, dtype),
         coarsened=np.zeros(pixels, bool),
     )
-    devices = jax.local_devices() if jax.default_backend() == "cpu" else jax.local_devices()[:1]
-    replicas = [jax.device_put((impostor, tables), device) for device in devices]
-    chunk = CHUNK
+    render = _Renderer(impostor, tables)
+    chunk = CHUNK * render.num_devices
     for _ in range(MAX_GROWTH):
-        chunks, outputs = [pending[i : i + chunk] for i in range(0, len(pending), chunk)], []
-        for turn, chosen in enumerate(chunks):
-            device, (replica, replica_tables) = turn % len(devices), replicas[turn % len(devices)]
+        chunks, outputs = _spread(pending, chunk), []
+        for chosen in chunks:
             padded = np.concatenate([chosen, np.full(chunk - len(chosen), chosen[-1])])
-            chunk_rays = jax.device_put(jax.tree.map(lambda x, p=padded: x[p], rays), devices[device])
-            outputs.append(_render(replica, chunk_rays, config, tables=replica_tables))
+            outputs.append(render(jax.tree.map(lambda x, p=padded: x[p], rays), config))
         overflowed = []
         for chosen, output in zip(chunks, outputs, strict=True):
             for name, target in frame._asdict().items():
@@ -104,11 +104,58 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
         pending = np.concatenate(overflowed) if overflowed else pending[:0]
         if not pending.size:
             return Frame(*(x.reshape(height, width, *x.shape[1:]) for x in frame))
-        config, chunk = _grow(config), REPAIR_CHUNK
+        config, chunk = _grow(config), REPAIR_CHUNK * render.num_devices
     raise RuntimeError(
         f"{pending.size} rays need more than {config.march.max_tets_per_ray} tets or "
         f"{config.march.max_entries_per_ray} entries; raise MarchConfig's sizes"
     )
+
+
+class _Renderer:
+    """`render_rays` with the rays split over the local devices, compiled once for all of them."""
+
+    def __init__(self, impostor: NeuralImpostor, tables: MarchTables):
+        mesh = _device_mesh()
+        self.num_devices = mesh.size
+        self._replicas = jax.device_put((impostor, tables), NamedSharding(mesh, P()))
+        self._rays = NamedSharding(mesh, P("rays"))
+
+    def __call__(self, rays: Rays, config: RenderConfig) -> RenderOutput:
+        """Start rendering; the number of rays is a multiple of the number of devices."""
+        return _render_sharded(*self._replicas, jax.device_put(rays, self._rays), config)
+
+
+@cache
+def _device_mesh() -> Mesh:
+    devices = jax.local_devices()
+    return jax.make_mesh((len(devices),), ("rays",), axis_types=(AxisType.Auto,), devices=devices)
+
+
+@partial(jax.jit, static_argnames="config")
+def _render_sharded(
+    impostor: NeuralImpostor, tables: MarchTables, rays: Rays, config: RenderConfig
+) -> RenderOutput:
+    @partial(
+        jax.shard_map,
+        mesh=_device_mesh(),
+        in_specs=(P(), P(), P("rays")),
+        out_specs=P("rays"),
+        check_vma=False,
+    )
+    def shard(impostor: NeuralImpostor, tables: MarchTables, rays: Rays) -> RenderOutput:
+        return render_rays(impostor, rays, config, tables=tables)
+
+    return shard(impostor, tables, rays)
+
+
+def _spread(rays: np.ndarray, chunk: int) -> list[np.ndarray]:
+    """Chunks of rays, each of image tiles from all over the picture, so that all need about equal buffers."""
+    tile = TILE * TILE
+    tiles = [rays[i : i + tile] for i in range(0, len(rays), tile)]
+    order = np.random.default_rng(0).permutation(len(tiles))
+    per_chunk = chunk // tile
+    hands = [order[i : i + per_chunk] for i in range(0, len(order), per_chunk)]
+    return [np.concatenate([tiles[j] for j in hand]) for hand in hands]
 
 
 def _grow(config: RenderConfig) -> RenderConfig:

@@ -26,7 +26,7 @@ from nimpostor_jax.geometry.intersect import face_weights, passes_left, project,
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.types import Rays, TetMesh
 
-CPU_TILE = 1024  # measured: smaller tiles pay per kernel, larger ones leave the cache and wait for stragglers
+CPU_TILE = 256  # an image tile: a larger one has a wider cone and waits longer for its last ray
 CODES_PER_TET = 36
 
 
