@@ -91,7 +91,7 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     )
     render = _Renderer(impostor, tables)
     chunk = CHUNK * render.num_devices
-    for _ in range(MAX_GROWTH):
+    for _ in range(MAX_GROWTH + 1):
         chunks, outputs = _spread(pending, chunk), []
         for chosen in chunks:
             padded = np.concatenate([chosen, np.full(chunk - len(chosen), chosen[-1])])
