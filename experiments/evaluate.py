@@ -24,6 +24,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--workdir", required=True, type=Path, help="of a training run")
     add_flags(parser)
     args = parser.parse_args(argv)
+    use_all_cores()
     saved = args.workdir / "config.gin"
     if not saved.exists():
         raise FileNotFoundError(
@@ -31,7 +32,6 @@ def main(argv: Sequence[str]) -> None:
         )
     config = load_config([saved, *(args.gin_configs or [])], args.gin_bindings or [])
     impostor = load_impostor(args.workdir / "impostor.npz")
-    use_all_cores()
     _, test = load_scene(resolve_scene(args.data), config.data)
     result = evaluate(
         impostor,

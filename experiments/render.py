@@ -35,13 +35,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--video", default="orbit.mp4", help="file name in the workdir: .mp4 or .gif")
     add_flags(parser)
     args = parser.parse_args(argv)
+    use_all_cores()
     if args.frames < 1:
         raise ValueError(f"--frames must be >= 1, got {args.frames}")
     config = load_config([args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or [])
     impostor = load_impostor(args.workdir / "impostor.npz")
     if args.deformation is not None:
         impostor = deform(impostor, load_deformation(args.deformation))
-    use_all_cores()
     train, _ = load_scene(resolve_scene(args.data), config.data)
     cameras = orbit(train, args.frames, size=args.size)
     sized = frame_config(impostor, cameras[0], config.render)

@@ -23,8 +23,13 @@ BINDINGS = (
 
 
 @pytest.fixture(scope="session")
-def config():
-    return load_config(bindings=BINDINGS)
+def bindings():
+    return list(BINDINGS)
+
+
+@pytest.fixture(scope="session")
+def config(bindings):
+    return load_config(bindings=bindings)
 
 
 @pytest.fixture(scope="session")

@@ -12,8 +12,6 @@ from nimpostor_jax.pipeline.evaluate import evaluate, orbit
 from nimpostor_jax.pipeline.fit import Progress, fit
 from nimpostor_jax.pipeline.prepare import prepare
 
-from .conftest import BINDINGS
-
 
 class Killed(Exception):
     """Stands for the end of the process."""
@@ -28,8 +26,8 @@ def arrays(impostor):
     return [np.asarray(leaf) for leaf in jax.tree.leaves((impostor.tables.features, impostor.decoders))]
 
 
-def test_killed_and_resumed_run_equals_one_that_was_not(cage, tmp_path):
-    config = load_config(bindings=[*BINDINGS, "TrainConfig.eval_every=5"])
+def test_killed_and_resumed_run_equals_one_that_was_not(bindings, cage, tmp_path):
+    config = load_config(bindings=[*bindings, "TrainConfig.eval_every=5"])
     scene = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
 
     def die(impostor, step):
@@ -79,9 +77,9 @@ def test_cage_beside_the_object_is_refused(config, cage, tmp_path):
         prepare(config, "fluffy_ball", cage=tmp_path / "beside.npz", log=lambda _: None)
 
 
-def test_checkpoint_of_another_configuration_is_refused(scene, cage, tmp_path):
+def test_checkpoint_of_another_configuration_is_refused(scene, bindings, cage, tmp_path):
     fit(scene, workdir=tmp_path, log=lambda _: None)
-    other = load_config(bindings=[*BINDINGS, "EncodingConfig.num_levels=2"])
+    other = load_config(bindings=[*bindings, "EncodingConfig.num_levels=2"])
     with pytest.raises(ValueError, match="num_levels"):
         fit(prepare(other, "fluffy_ball", cage=cage, log=lambda _: None), workdir=tmp_path)
 

@@ -105,6 +105,7 @@ def fit(
         state, impostor, pool = jax.device_put((state, impostor, pool), replicated(mesh))
         gradient = data_parallel(mesh)
         place = partial(jax.device_put, device=over_rays(mesh))
+    state = jax.tree.map(jnp.copy, state)  # steps consume their state; the scene's arrays stay the caller's
     render = scene.render
     for _ in range(progress.growths):
         render = _grow(render)
