@@ -138,13 +138,15 @@ def time_training(scene: Scene, interpolation: str, trained: NeuralImpostor | No
 
     first, median = measure(call, repeats)
     samples = count_samples(scene, size)
+    visible = size * (scene.render.visible_per_ray or scene.render.sampler.max_samples_per_ray)
     return {
         "name": f"train_step_{encoding.layout}_{interpolation}",
         "ms": 1e3 * median,
         "compile_s": first - median,
         "rays": size,
-        "samples": samples,
+        "samples": samples,  # densities; gradients only of those that fit `visible_per_ray`
         "samples_per_second": samples / median,
+        "gradient_samples_per_second": min(samples, visible) / median,
         "rays_per_second": size / median,
     }
 
