@@ -58,18 +58,18 @@ def composite(sigmas, deltas):
 
 def node_entry(layout, config, level, tet, node):
     """The table entry of a grid node, given in the order of the tet's canonical corners."""
-    resolution = config.resolutions[level]
+    resolution, start = config.resolutions[level], int(layout.starts[level])
     regions = np.asarray(layout.regions[level])
     mask = sum(1 << i for i, u in enumerate(node) if u > 0)
     region = int(regions[tet, 0 if regions.shape[1] == 1 else mask])
     offset, log2 = region >> SIZE_BITS, region % (1 << SIZE_BITS)
-    ranks = layout.dense_ranks[level]
-    if ranks is not None:
-        return offset + int(ranks[sum(u * (resolution + 1) ** i for i, u in enumerate(node))])
+    if level < len(layout.dense_ranks):
+        index = sum(u * (resolution + 1) ** i for i, u in enumerate(node))
+        return start + offset + int(layout.dense_ranks[level][index])
     hashed = 0
     for u, multiplier in zip(node, np.asarray(layout.multipliers)[tet], strict=True):
         hashed ^= int(u) * int(multiplier) % (1 << 32)
-    return offset + hashed % (1 << log2)
+    return start + offset + hashed % (1 << log2)
 
 
 def grid_nodes(coordinates, resolution):
@@ -99,9 +99,8 @@ def encode(features, layout, config, tet, coordinates):
     """Features of one point, level by level, from nodes and their entries."""
     canonical = np.asarray(coordinates, np.float64)[np.asarray(layout.corner_order)[tet]]
     nodes = grid_nodes if config.interpolation == "grid" else simplex_nodes
-    levels = []
+    table, levels = np.asarray(features, np.float64), []
     for level, resolution in enumerate(config.resolutions):
-        table = np.asarray(features[level], np.float64)
         terms = [
             w * table[node_entry(layout, config, level, tet, u)] for u, w in nodes(canonical, resolution) if w
         ]

@@ -46,7 +46,7 @@ def impostor(name="cube", dtype="float32", scale=1.0, offset=0.0, seed=0):
     mesh = build_tet_mesh(vertices * scale + offset, tets, dtype=dtype)
     made = init_impostor(jax.random.key(seed), mesh, FIELD)
     rng = np.random.default_rng(seed)
-    features = tuple(jnp.asarray(rng.normal(size=f.shape), dtype) for f in made.tables.features)
+    features = jnp.asarray(rng.normal(size=made.tables.features.shape), dtype)
     decoders = jax.tree.map(lambda x: jnp.asarray(0.7 * rng.normal(size=x.shape), dtype), made.decoders)
     decoders["density"][-1]["bias"] -= 1.5  # most rays neither empty nor opaque
     return made.replace(tables=made.tables.replace(features=features), decoders=decoders)

@@ -79,22 +79,23 @@ class TetSegments:
 class HashLayout:
     """Which table entries a tet's grid nodes own (`paper/notes`: per_tet and per_simplex).
 
-    `regions[l][t, m]` packs offset * 32 + log2(size) of the region of level l in which tet t keeps the nodes
+    `regions[l, t, m]` packs offset * 32 + log2(size) of the region of level l in which tet t keeps the nodes
     whose set of nonzero coordinates is the 4-bit mask m (one column where all masks share a region).
-    `dense_ranks[l]` is the collision-free index of each node where level l is stored densely, else None.
+    `dense_ranks[l]` is the collision-free index of each node of level l; only the coarsest levels have it.
     """
 
-    regions: tuple[Int[Array, "T masks"], ...]
+    starts: Int[Array, " L+1"]  # first entry of each level, and the number of entries
+    regions: Int[Array, "L T masks"]
     multipliers: UInt[Array, "T 4"]  # hash factor of each corner
     corner_order: Int[Array, "T 4"]  # the tet's corners by ascending vertex id
-    dense_ranks: tuple[Int[Array, " nodes"] | None, ...]
+    dense_ranks: tuple[Int[Array, " nodes"], ...]
 
 
 @struct.dataclass
 class HashTables:
-    """Trainable features, one packed array a level, and the layout that addresses them."""
+    """Trainable features of all levels in one packed array, and the layout that addresses them."""
 
-    features: tuple[Float[Array, "entries F"], ...]
+    features: Float[Array, "entries F"]
     layout: HashLayout
 
 

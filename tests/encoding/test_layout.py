@@ -36,14 +36,14 @@ def test_regions_never_alias(layout_name, interpolation):
     """Each entry belongs to one sub-simplex, and all lie inside the table."""
     _, tets = cube()
     config = config_of(layout_name, interpolation, num_levels=4, log2_tet_table=8)
-    layout, entries = build_layout(tets, config)
+    layout = build_layout(tets, config)
     order = np.asarray(layout.corner_order)
     for level, resolution in enumerate(config.resolutions):
         owners = {}
         for tet in range(len(tets)):
             for node in reachable_nodes(resolution, slab_half_width(config)):
                 entry = oracles.node_entry(layout, config, level, tet, node)
-                assert 0 <= entry < entries[level]
+                assert layout.starts[level] <= entry < layout.starts[level + 1]
                 key = owner(layout_name, tet, tets[tet][order[tet]], node)
                 assert owners.setdefault(entry, key) == key
 
@@ -52,24 +52,25 @@ def test_regions_never_alias(layout_name, interpolation):
 def test_packed_regions_are_disjoint_on_a_larger_mesh(layout_name):
     _, tets = nonconvex()
     config = config_of(layout_name, "grid", num_levels=7)
-    layout, entries = build_layout(tets, config)
+    layout = build_layout(tets, config)
     for level in range(7):
         regions = np.asarray(layout.regions[level])
-        dense = layout.dense_ranks[level] is not None
+        dense = level < len(layout.dense_ranks)
         unique = np.unique(regions)
         starts, sizes = unique >> SIZE_BITS, 1 << (unique & ((1 << SIZE_BITS) - 1))
         ends = starts + (1 if dense else sizes)
         assert np.all(starts[1:] >= ends[:-1])
-        assert ends.max() <= entries[level]
+        size = layout.starts[level + 1] - layout.starts[level]
+        assert ends.max() <= size
         if not dense:
-            assert ends.max() == entries[level]  # nothing is wasted
+            assert ends.max() == size  # nothing is wasted
 
 
 @pytest.mark.parametrize("layout_name, interpolation", KINDS)
 def test_dense_levels_are_collision_free_and_full(layout_name, interpolation):
     _, tets = cube()
     config = config_of(layout_name, interpolation, num_levels=3)
-    layout, entries = build_layout(tets, config)
+    layout = build_layout(tets, config)
     order = np.asarray(layout.corner_order)
     dense = 0
     for level, resolution in enumerate(config.resolutions):
@@ -86,7 +87,7 @@ def test_dense_levels_are_collision_free_and_full(layout_name, interpolation):
                     tuple(u for u in node if u or layout_name == "per_tet"),
                 )
                 assert used.setdefault(entry, place) == place
-        missing = set(range(entries[level])) - set(used)
+        missing = set(range(*map(int, layout.starts[level : level + 2]))) - set(used)
         assert len(missing) <= 1  # entry 0, the all-zero node, is only reachable at coarse levels
     assert dense >= 2
 
@@ -95,7 +96,7 @@ def test_neighbours_agree_on_the_nodes_of_their_common_face():
     _, tets = delaunay(count=10)
     for interpolation in ("grid", "simplex"):
         config = config_of("per_simplex", interpolation, num_levels=5, log2_tet_table=8)
-        layout, _ = build_layout(tets, config)
+        layout = build_layout(tets, config)
         order = np.asarray(layout.corner_order)
         places = {}
         for level, resolution in enumerate(config.resolutions):
@@ -117,7 +118,7 @@ def test_per_simplex_is_never_larger_than_per_tet(make, interpolation, log2):
     sizes = {}
     for name in ("per_simplex", "per_tet"):
         config = config_of(name, interpolation, num_levels=9, log2_tet_table=log2)
-        sizes[name] = build_layout(tets, config)[1]
+        sizes[name] = np.diff(build_layout(tets, config).starts)
     budget = len(tets) << log2
     assert max(sizes["per_simplex"]) <= budget
     assert max(sizes["per_tet"]) <= budget
@@ -127,7 +128,9 @@ def test_per_simplex_is_never_larger_than_per_tet(make, interpolation, log2):
 def test_hashed_levels_use_the_budget():
     """A limit that is respected by storing nothing would be worthless."""
     _, tets = nonconvex()
-    _, entries = build_layout(tets, config_of("per_simplex", "grid", num_levels=8, log2_tet_table=8))
+    entries = np.diff(
+        build_layout(tets, config_of("per_simplex", "grid", num_levels=8, log2_tet_table=8)).starts
+    )
     assert entries[-1] > 0.4 * (len(tets) << 8)  # sizes are powers of two
 
 
@@ -140,10 +143,10 @@ def test_offsets_that_do_not_fit_their_integers_are_refused():
 
 def test_corner_order_sorts_by_vertex_id():
     _, tets = delaunay(count=12)
-    layout, _ = build_layout(tets, config_of("per_simplex", "grid"))
+    layout = build_layout(tets, config_of("per_simplex", "grid"))
     ordered = np.take_along_axis(tets, np.asarray(layout.corner_order), axis=1)
     assert np.all(np.diff(ordered, axis=1) > 0)
-    layout, _ = build_layout(tets, config_of("per_tet", "grid"))
+    layout = build_layout(tets, config_of("per_tet", "grid"))
     assert_array_equal(layout.corner_order, np.broadcast_to(np.arange(4), tets.shape))
 
 

@@ -67,10 +67,11 @@ def impostor(rng):
         vertices=floats[:, :1].repeat(3, 1), tets=jnp.array([[0, 1, 2, 3], [1, 2, 3, 4]], jnp.int32)
     )
     layout = HashLayout(
-        regions=(jnp.arange(4).reshape(2, 2), jnp.zeros((2, 0), jnp.int32)),
+        starts=jnp.array([0, 2, 6]),
+        regions=jnp.arange(4).reshape(2, 2, 1),
         multipliers=jnp.array([[1, 2654435761, 4294967295, 0]], jnp.uint32),
         corner_order=jnp.array([[3, 1, 0, 2]]),
-        dense_ranks=(None, jnp.arange(3)),
+        dense_ranks=(None, jnp.arange(3), jnp.zeros((2, 0), jnp.int32)),
     )
     decoders = {
         "density": [{"kernel": floats[None], "bias": jnp.ones((1, 2), jnp.bfloat16)}],
@@ -78,7 +79,7 @@ def impostor(rng):
     }
     return NeuralImpostor(
         mesh=mesh,
-        tables=HashTables(features=(floats, 2 * floats), layout=layout),
+        tables=HashTables(features=floats, layout=layout),
         decoders=decoders,
         decoder_index=jnp.zeros(2, jnp.int32),
         config=ImpostorConfig(encoding=EncodingConfig(num_levels=2, layout="per_tet")),

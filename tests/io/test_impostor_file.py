@@ -55,7 +55,8 @@ def rewrite_header(path, change):
 @pytest.mark.parametrize(
     "change, message",
     [
-        (lambda h: h.update(version=2), "has format 2, newer than 1; update nimpostor-jax"),
+        (lambda h: h.update(version=3), "has format 3, not 2; update nimpostor-jax"),
+        (lambda h: h.update(version=1), "has format 1, not 2; train and save it again"),
         (lambda h: h.update(version="x"), "is not an impostor file"),
         (lambda h: h.update(format="other"), "is not an impostor file"),
         (lambda h: h.pop("format"), "damaged, or not an impostor file"),
@@ -115,7 +116,7 @@ def test_a_changed_byte_is_noticed(tmp_path, impostor):
     path = tmp_path / "a.npz"
     save_impostor(path, impostor)
     data = bytearray(path.read_bytes())
-    raw = np.asarray(impostor.tables.features[1]).tobytes()
+    raw = np.asarray(impostor.tables.features).tobytes()
     data[data.index(raw) + 5] ^= 1
     path.write_bytes(data)
     with pytest.raises(ValueError, match=r"a\.npz is damaged"):

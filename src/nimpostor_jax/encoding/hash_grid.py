@@ -4,31 +4,37 @@ Each level interpolates the features of nearby nodes of a grid over the tet's fo
 of the enclosing 4D voxel (`grid`, the paper's), or the 4 corners of the enclosing simplex of the tet's
 edgewise subdivision (`simplex`). Which table entry a node owns is the layout's business (`layout.py`).
 
+Levels are taken one after another by a loop. XLA would otherwise fuse them all into one kernel that computes
+shared coordinates and addresses anew for every output: three times slower on a CPU, and slow to compile.
+
 Axes: M points, L levels, F features per level.
 """
 
 import itertools
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from flax import struct
+from jaxtyping import Array, Float, Int, UInt
 
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.layout import SIZE_BITS
 from nimpostor_jax.types import HashLayout, HashTables
 
-Coordinates = list[Float[Array, " M"]]
+Coordinates = tuple[Float[Array, " M"], ...]
 Nodes = list[Int[Array, " M"]]
+Corners = tuple[list[Float[Array, " M"]], list[Nodes]]
+_CornersOf = Callable[[Coordinates], Corners]
+_AddressOf = Callable[[Nodes], Int[Array, " M"]]
 
 
-def init_features(key: Array, entries: tuple[int, ...], config: EncodingConfig) -> tuple[Array, ...]:
-    """Small uniform features for every level's table."""
-    keys = jax.random.split(key, len(entries))
-    shape = config.features_per_level
-    return tuple(
-        jax.random.uniform(k, (n, shape), minval=-config.init_scale, maxval=config.init_scale)
-        for k, n in zip(keys, entries, strict=True)
-    )
+def init_features(key: Array, num_entries: int, config: EncodingConfig) -> Float[Array, "entries F"]:
+    """Small uniform features for all levels' tables."""
+    shape, scale = (num_entries, config.features_per_level), config.init_scale
+    return jax.random.uniform(key, shape, minval=-scale, maxval=scale)
 
 
 def encode(
@@ -39,15 +45,26 @@ def encode(
 ) -> Float[Array, "M L*F"]:
     """Features f_p of points given by tet and barycentric coordinates, all levels concatenated (Eq. 6).
 
-    Differentiable in the tables and, between grid nodes, in the coordinates.
+    Differentiable in the tables and, between grid nodes, in the coordinates, in reverse mode.
     """
-    coordinates = _canonical(tables.layout, config, tet_ids, lambdas)
-    interpolate = _grid_corners if config.interpolation == "grid" else _simplex_corners
-    levels = []
-    for level, resolution in enumerate(config.resolutions):
-        entries, weights = interpolate(tables.layout, level, resolution, tet_ids, coordinates)
-        levels.append(_interpolate(tables.features[level], entries, weights))
-    return jnp.concatenate(levels, axis=-1)
+    layout = tables.layout
+    plan = _Plan(
+        tet_ids=tet_ids,
+        multipliers=tuple(layout.multipliers[:, i][tet_ids] for i in range(4)),
+        layout=layout,
+    )
+    coordinates = _canonical(layout, config, tet_ids, lambdas)
+    levels = _interpolate_levels(config, tables.features, coordinates, plan)
+    return levels.reshape(tet_ids.shape[0], config.feature_dim)
+
+
+@struct.dataclass
+class _Plan:
+    """What all levels need to address a point's nodes."""
+
+    tet_ids: Int[Array, " M"]
+    multipliers: tuple[UInt[Array, " M"], ...]  # of the tet's four corners
+    layout: HashLayout
 
 
 def _canonical(
@@ -59,7 +76,7 @@ def _canonical(
     """Coordinates by ascending vertex id where neighbours share nodes, clipped to the simplex's range."""
     lambdas = jnp.clip(lambdas, 0, 1)
     if config.layout == "per_tet":
-        return [lambdas[:, i] for i in range(4)]
+        return tuple(lambdas[:, i] for i in range(4))
     shifts = jnp.arange(0, 8, 2)
     packed = jnp.sum(layout.corner_order << shifts, axis=1)[tet_ids]  # four times 2 bits: one gather
     columns = []
@@ -68,84 +85,102 @@ def _canonical(
         low = jnp.where(corner == 1, lambdas[:, 1], lambdas[:, 0])
         high = jnp.where(corner == 3, lambdas[:, 3], lambdas[:, 2])
         columns.append(jnp.where(corner >= 2, high, low))
-    return columns
+    return tuple(columns)
 
 
-def _interpolate(
-    features: Float[Array, "entries F"],
-    entries: list[Int[Array, " M"]],
-    weights: list[Float[Array, " M"]],
-) -> Float[Array, "M F"]:
-    """Weighted sum of table rows; one gather a corner, accumulated, is what XLA's CPU back end does best."""
-    return _gather_sum(features, tuple(entries), tuple(weights))
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _interpolate_levels(
+    config: EncodingConfig, features: Float[Array, "entries F"], coordinates: Coordinates, plan: _Plan
+) -> Float[Array, "M L F"]:
+    """Weighted sums of table rows; one gather a corner, accumulated, is what XLA's CPU back end does best."""
+
+    def add_level(level: Array, corners: _CornersOf, address: _AddressOf, out: Array) -> Array:
+        weights, nodes = corners(coordinates)
+        total = sum(w[:, None] * _rows(features, address(u)) for w, u in zip(weights, nodes, strict=True))
+        return jax.lax.dynamic_update_index_in_dim(out, total, level, 1)
+
+    shape = (plan.tet_ids.shape[0], config.num_levels, features.shape[1])
+    return _for_levels(config, plan, add_level, jnp.zeros(shape, features.dtype))
 
 
-@jax.custom_vjp
-def _gather_sum(features, entries, weights):  # type: ignore[no-untyped-def]
-    total = jnp.zeros((entries[0].shape[0], features.shape[1]), features.dtype)
-    for index, weight in zip(entries, weights, strict=True):
-        total += weight[:, None] * features.at[index].get(mode="promise_in_bounds")
-    return total
+def _interpolate_levels_forward(
+    config: EncodingConfig, features: Float[Array, "entries F"], coordinates: Coordinates, plan: _Plan
+) -> tuple[Array, tuple]:
+    return _interpolate_levels(config, features, coordinates, plan), (features, coordinates, plan)
 
 
-def _gather_sum_forward(features, entries, weights):  # type: ignore[no-untyped-def]
-    return _gather_sum(features, entries, weights), (features, entries, weights)
+def _interpolate_levels_backward(
+    config: EncodingConfig, residuals: tuple, cotangent: Float[Array, "M L F"]
+) -> tuple:
+    features, coordinates, plan = residuals
+
+    def add_level(level: Array, corners: _CornersOf, address: _AddressOf, sums: tuple) -> tuple:
+        d_features, d_coordinates = sums
+        weights, pull, nodes = jax.vjp(corners, coordinates, has_aux=True)
+        d_level = jax.lax.dynamic_index_in_dim(cotangent, level, 1, keepdims=False)
+        d_weights = []
+        for weight, node in zip(weights, nodes, strict=True):
+            entries = address(node)
+            d_weights.append(jnp.sum(_rows(features, entries) * d_level, axis=-1).astype(weight.dtype))
+            d_rows = weight[:, None] * d_level
+            d_features = d_features.at[entries].add(d_rows, mode="promise_in_bounds")
+        return d_features, jax.tree.map(jnp.add, d_coordinates, *pull(d_weights))
+
+    zeros = jax.tree.map(jnp.zeros_like, (features, coordinates))
+    return *_for_levels(config, plan, add_level, zeros), None
 
 
-def _gather_sum_backward(residuals, cotangent):  # type: ignore[no-untyped-def]
-    features, entries, weights = residuals
-    d_features = jnp.zeros_like(features)
-    d_weights = []
-    for index, weight in zip(entries, weights, strict=True):
-        rows = features.at[index].get(mode="promise_in_bounds")
-        d_weights.append(jnp.sum(rows * cotangent, axis=-1).astype(weight.dtype))
-        d_features = d_features.at[index].add(weight[:, None] * cotangent, mode="promise_in_bounds")
-    return d_features, tuple(None for _ in entries), tuple(d_weights)
+_interpolate_levels.defvjp(_interpolate_levels_forward, _interpolate_levels_backward)
 
 
-_gather_sum.defvjp(_gather_sum_forward, _gather_sum_backward)
+def _rows(features: Float[Array, "entries F"], entries: Int[Array, " M"]) -> Float[Array, "M F"]:
+    return features.at[entries].get(mode="promise_in_bounds")
 
 
-def _grid_corners(
-    layout: HashLayout,
-    level: int,
-    resolution: int,
-    tet_ids: Int[Array, " M"],
-    coordinates: Coordinates,
-) -> tuple[list, list]:
-    """Table entries and 4-linear weights of the 16 corners of each point's voxel."""
+def _for_levels(config: EncodingConfig, plan: _Plan, add_level: Callable, carry: Any) -> Any:
+    """Fold `add_level` over the levels: first the densely stored, then the hashed ones."""
+    corners = _grid_corners if config.interpolation == "grid" else _simplex_corners
+    resolutions = jnp.asarray(config.resolutions, jnp.int32)
+    num_dense = len(plan.layout.dense_ranks)
+
+    def body(level: Array, carry: Any, dense: bool) -> Any:
+        resolution = resolutions[level]
+        address = _dense_address if dense else _hashed_address
+        return add_level(
+            level, partial(corners, resolution), partial(address, plan, level, resolution), carry
+        )
+
+    carry = jax.lax.fori_loop(0, num_dense, partial(body, dense=True), carry)
+    return jax.lax.fori_loop(num_dense, config.num_levels, partial(body, dense=False), carry)
+
+
+def _grid_corners(resolution: Int[Array, ""], coordinates: Coordinates) -> Corners:
+    """4-linear weights and nodes of the 16 corners of each point's voxel."""
     low, fractions = [], []
     for coordinate in coordinates:
-        scaled = coordinate * resolution
-        cell = jnp.clip(jnp.floor(jax.lax.stop_gradient(scaled)), 0, resolution - 1)
+        scaled = coordinate * resolution.astype(coordinate.dtype)
+        cell = _cell(scaled, resolution)
         low.append(cell.astype(jnp.int32))
         fractions.append(scaled - cell)
-    address = _addressing(layout, level, resolution, tet_ids)
-    entries, weights = [], []
+    weights, nodes = [], []
     for bits in itertools.product((0, 1), repeat=4):
-        entries.append(address([u + b for u, b in zip(low, bits, strict=True)]))
         sides = [f if b else 1 - f for f, b in zip(fractions, bits, strict=True)]
         weights.append((sides[0] * sides[1]) * (sides[2] * sides[3]))
-    return entries, weights
+        nodes.append([u + b for u, b in zip(low, bits, strict=True)])
+    return weights, nodes
 
 
-def _simplex_corners(
-    layout: HashLayout,
-    level: int,
-    resolution: int,
-    tet_ids: Int[Array, " M"],
-    coordinates: Coordinates,
-) -> tuple[list, list]:
-    """Table entries and weights of the 4 corners of each point's simplex in the edgewise subdivision.
+def _simplex_corners(resolution: Int[Array, ""], coordinates: Coordinates) -> Corners:
+    """Weights and nodes of the 4 corners of each point's simplex in the edgewise subdivision.
 
     In the cumulative coordinates N (l0, l0 + l1, l0 + l1 + l2) the subdivision is Kuhn's: within a unit cube
     the path from the lowest corner to the highest takes the axes by descending fraction. Ties take the
     later axis first, which keeps the cumulative coordinates ascending and hence all nodes valid.
     """
     l0, l1, l2, _ = coordinates
-    cumulative = [resolution * l0, resolution * (l0 + l1), resolution * (l0 + l1 + l2)]
-    cumulative = [jnp.minimum(c, resolution) for c in cumulative]
-    cells = [jnp.clip(jnp.floor(jax.lax.stop_gradient(c)), 0, resolution - 1) for c in cumulative]
+    extent = resolution.astype(l0.dtype)
+    cumulative = [jnp.minimum(extent * c, extent) for c in (l0, l0 + l1, l0 + l1 + l2)]
+    cells = [_cell(c, resolution) for c in cumulative]
     f1, f2, f3 = (c - cell for c, cell in zip(cumulative, cells, strict=True))
     low = [cell.astype(jnp.int32) for cell in cells]
     ahead_21, ahead_31, ahead_32 = f2 >= f1, f3 >= f1, f3 >= f2
@@ -157,35 +192,48 @@ def _simplex_corners(
     largest, smallest = jnp.maximum(jnp.maximum(f1, f2), f3), jnp.minimum(jnp.minimum(f1, f2), f3)
     median = jnp.maximum(jnp.minimum(f1, f2), jnp.minimum(jnp.maximum(f1, f2), f3))
     weights = [1 - largest, largest - median, median - smallest, smallest]
-    address = _addressing(layout, level, resolution, tet_ids)
-    entries = []
+    nodes = []
     for taken in range(4):
         y1, y2, y3 = (cell + (rank < taken) for cell, rank in zip(low, ranks, strict=True))
-        entries.append(address([y1, y2 - y1, y3 - y2, resolution - y3]))
-    return entries, weights
+        nodes.append([y1, y2 - y1, y3 - y2, resolution - y3])
+    return weights, nodes
 
 
-def _addressing(layout: HashLayout, level: int, resolution: int, tet_ids: Int[Array, " M"]):  # type: ignore[no-untyped-def]
-    """A function from nodes (four integer coordinates) to table entries of the level."""
-    regions, ranks = layout.regions[level], layout.dense_ranks[level]
-    num_masks = regions.shape[1]
-    flat_regions, base = regions.reshape(-1), tet_ids * num_masks
-    multipliers = [layout.multipliers[:, i][tet_ids] for i in range(4)] if ranks is None else []
+def _cell(scaled: Float[Array, " M"], resolution: Int[Array, ""]) -> Float[Array, " M"]:
+    """The integer below, of a grid's cells; constant between nodes."""
+    last = (resolution - 1).astype(scaled.dtype)
+    return jnp.clip(jnp.floor(jax.lax.stop_gradient(scaled)), 0, last)
 
-    def address(node: Nodes) -> Int[Array, " M"]:
-        if num_masks == 1:
-            region = flat_regions[base]
-        else:
-            mask = sum((u > 0).astype(jnp.int32) << i for i, u in enumerate(node))
-            region = flat_regions.at[base + mask].get(mode="promise_in_bounds")
-        if ranks is not None:
-            stride = resolution + 1
-            local = ranks[((node[3] * stride + node[2]) * stride + node[1]) * stride + node[0]]
-        else:
-            mixed = [u.astype(jnp.uint32) * m for u, m in zip(node, multipliers, strict=True)]
-            hashed = (mixed[0] ^ mixed[1]) ^ (mixed[2] ^ mixed[3])
-            log2 = (region & ((1 << SIZE_BITS) - 1)).astype(jnp.uint32)
-            local = (hashed & ((jnp.uint32(1) << log2) - 1)).astype(jnp.int32)
-        return (region >> SIZE_BITS) + local
 
-    return address
+def _dense_address(
+    plan: _Plan, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
+) -> Int[Array, " M"]:
+    """Table entries of nodes (four integer coordinates) at a densely stored level."""
+    ranks = plan.layout.dense_ranks
+    starts = jnp.asarray([0, *itertools.accumulate(len(r) for r in ranks)], jnp.int32)
+    stride = resolution + 1
+    index = ((node[3] * stride + node[2]) * stride + node[1]) * stride + node[0]
+    rank = jnp.concatenate(ranks).at[starts[level] + index].get(mode="promise_in_bounds")
+    return plan.layout.starts[level] + (_region(plan, level, node) >> SIZE_BITS) + rank
+
+
+def _hashed_address(
+    plan: _Plan, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
+) -> Int[Array, " M"]:
+    """Table entries of nodes at a hashed level."""
+    region = _region(plan, level, node)
+    mixed = [u.astype(jnp.uint32) * m for u, m in zip(node, plan.multipliers, strict=True)]
+    hashed = (mixed[0] ^ mixed[1]) ^ (mixed[2] ^ mixed[3])
+    log2 = (region & ((1 << SIZE_BITS) - 1)).astype(jnp.uint32)
+    local = (hashed & ((jnp.uint32(1) << log2) - 1)).astype(jnp.int32)
+    return plan.layout.starts[level] + (region >> SIZE_BITS) + local
+
+
+def _region(plan: _Plan, level: Int[Array, ""], node: Nodes) -> Int[Array, " M"]:
+    """The packed region of each node: of the tet, or of the sub-simplex that its nonzero coordinates name."""
+    num_masks = plan.layout.regions.shape[2]
+    regions = plan.layout.regions[level].reshape(-1)
+    index = plan.tet_ids * num_masks
+    if num_masks > 1:
+        index += sum((u > 0).astype(jnp.int32) << i for i, u in enumerate(node))
+    return regions.at[index].get(mode="promise_in_bounds")

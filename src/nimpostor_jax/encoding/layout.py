@@ -34,11 +34,8 @@ def slab_half_width(config: EncodingConfig) -> int:
     return 3 if config.interpolation == "grid" else 0
 
 
-def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> tuple[HashLayout, tuple[int, ...]]:
-    """The layout for a mesh's tets and the number of entries of each level.
-
-    Raises ValueError where a level's entries cannot be addressed in 32 bits.
-    """
+def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> HashLayout:
+    """The layout for a mesh's tets. Raises ValueError where entries cannot be addressed in 32 bits."""
     tets = np.asarray(tets)
     if config.layout == "per_tet":
         regions, entries, ranks = _per_tet(len(tets), config)
@@ -49,18 +46,20 @@ def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> tuple[
         ascending = np.take_along_axis(tets, order, axis=1)
         regions, entries, ranks = _per_simplex(ascending, config)
         multipliers = _vertex_multipliers(ascending)
-    if max(entries) > 1 << (31 - SIZE_BITS):
+    if max(entries) > 1 << (31 - SIZE_BITS) or sum(entries) >= 1 << 31:
         raise ValueError(
-            f"a level of {max(entries)} entries for {len(tets)} tets is more than 2**{31 - SIZE_BITS}; "
+            f"{sum(entries):,} table entries for {len(tets)} tets, {max(entries):,} of them in one level, "
+            f"cannot be addressed (2**31, and 2**{31 - SIZE_BITS} a level); "
             "lower EncodingConfig.min_log2_tet_table or log2_tet_table"
         )
-    layout = HashLayout(
-        regions=tuple(jnp.asarray(r, jnp.int32) for r in regions),
+    num_dense = sum(rank is not None for rank in ranks)  # the coarsest: nodes grow with the resolution
+    return HashLayout(
+        starts=jnp.asarray([0, *itertools.accumulate(entries)], jnp.int32),
+        regions=jnp.asarray(np.stack(regions), jnp.int32),
         multipliers=jnp.asarray(multipliers, jnp.uint32),
         corner_order=jnp.asarray(order, jnp.int32),
-        dense_ranks=tuple(None if r is None else jnp.asarray(r, jnp.int32) for r in ranks),
+        dense_ranks=tuple(jnp.asarray(rank, jnp.int32) for rank in ranks[:num_dense]),
     )
-    return layout, tuple(entries)
 
 
 def _per_tet(num_tets: int, config: EncodingConfig) -> tuple[list, list, list]:

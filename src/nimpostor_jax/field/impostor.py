@@ -16,10 +16,11 @@ from nimpostor_jax.types import HashTables, NeuralImpostor, TetMesh
 def init_impostor(key: Array, mesh: TetMesh, config: ImpostorConfig) -> NeuralImpostor:
     """An untrained impostor on a cage: packed tables, one decoder set. Host code: builds the layout."""
     table_key, decoder_key = jax.random.split(key)
-    layout, entries = build_layout(np.asarray(mesh.tets), config.encoding)
+    layout = build_layout(np.asarray(mesh.tets), config.encoding)
+    num_entries = int(layout.starts[-1])
     return NeuralImpostor(
         mesh=mesh,
-        tables=HashTables(features=init_features(table_key, entries, config.encoding), layout=layout),
+        tables=HashTables(features=init_features(table_key, num_entries, config.encoding), layout=layout),
         decoders=init_decoders(decoder_key, config),
         decoder_index=jnp.zeros(mesh.tets.shape[0], jnp.int32),
         config=config,

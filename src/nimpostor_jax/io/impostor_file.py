@@ -20,7 +20,7 @@ from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.types import NeuralImpostor
 
 _FORMAT = "nimpostor_jax.NeuralImpostor"
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2  # 1 had one array of features a level
 _HEADER = "header.json"
 # What NumPy, zipfile and zlib raise for a file that is cut short, changed, or something else.
 _DAMAGE = (
@@ -61,7 +61,7 @@ def load_impostor(path: str | Path) -> NeuralImpostor:
     """Read what `save_impostor` wrote; every array has the bits and dtype that it had.
 
     Raises FileNotFoundError for a missing file, ValueError for one that is not an impostor file, is
-    damaged, is of a newer version, or holds float64 while jax runs without `jax_enable_x64`.
+    damaged, is of another version, or holds float64 while jax runs without `jax_enable_x64`.
     """
     path = Path(path)
     if not path.is_file():
@@ -78,10 +78,9 @@ def load_impostor(path: str | Path) -> NeuralImpostor:
         ) from error
     if not recognised:
         raise ValueError(f"{path} is not an impostor file")
-    if version > _FORMAT_VERSION:
-        raise ValueError(
-            f"{path} has format {version}, newer than {_FORMAT_VERSION}; update nimpostor-jax"
-        )
+    if version != _FORMAT_VERSION:
+        remedy = "update nimpostor-jax" if version > _FORMAT_VERSION else "train and save it again"
+        raise ValueError(f"{path} has format {version}, not {_FORMAT_VERSION}; {remedy}")
     try:
         config = from_dict(ImpostorConfig, header["config"])
         impostor = _unpack(header["structure"], stored, config)

@@ -89,7 +89,7 @@ def prepare(
     log(f"{len(pool.views):,} training rays hit the cage; {missed:.4%} of opaque pixels do not")
     key = jax.random.key(config.train.seed)
     impostor = init_impostor(key, mesh, config.impostor)
-    entries = [f.shape[0] for f in impostor.tables.features]
+    entries = np.diff(impostor.tables.layout.starts).tolist()
     log(f"{len(tets)} tets, {sum(entries):,} table entries in {len(entries)} levels {entries}")
     finest = config.impostor.encoding.resolutions[-1]
     log(f"the finest grid cell is {pixels_per_cell(vertices, tets, train, finest):.2f} pixels wide")
