@@ -56,6 +56,11 @@ def composite(sigmas, deltas):
     return np.array(weights)
 
 
+def is_dense(layout, level):
+    """Whether a level's nodes are numbered without collisions."""
+    return level < len(layout.rank_starts) - 1
+
+
 def node_entry(layout, config, level, tet, node):
     """The table entry of a grid node, given in the order of the tet's canonical corners."""
     resolution, start = config.resolutions[level], int(layout.starts[level])
@@ -63,9 +68,9 @@ def node_entry(layout, config, level, tet, node):
     mask = sum(1 << i for i, u in enumerate(node) if u > 0)
     region = int(regions[tet, 0 if regions.shape[1] == 1 else mask])
     offset, log2 = region >> SIZE_BITS, region % (1 << SIZE_BITS)
-    if level < len(layout.dense_ranks):
+    if is_dense(layout, level):
         index = sum(u * (resolution + 1) ** i for i, u in enumerate(node))
-        return start + offset + int(layout.dense_ranks[level][index])
+        return start + offset + int(layout.dense_ranks[int(layout.rank_starts[level]) + index])
     hashed = 0
     for u, multiplier in zip(node, np.asarray(layout.multipliers)[tet], strict=True):
         hashed ^= int(u) * int(multiplier) % (1 << 32)

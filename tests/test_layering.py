@@ -13,7 +13,7 @@ PACKAGE = ROOT / "src" / "nimpostor_jax"
 MAX_LINES = 400
 
 # The core, lowest first: a layer imports only itself and what stands before it.
-CORE = ["config", "types", "geometry", "encoding", "field", "render", "train", "edit", "simulate"]
+CORE = ["config", "types", "chunks", "geometry", "encoding", "field", "render", "train", "edit", "simulate"]
 # On top of the core, which imports none of them. Among each other they must not form a cycle.
 OUTER = ["preprocess", "io", "export", "lpips", "metrics", "gin_flags", "pipeline"]
 # Where a library may be imported: a folder (with a slash at its end) or a file.

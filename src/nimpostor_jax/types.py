@@ -81,14 +81,16 @@ class HashLayout:
 
     `regions[l, t, m]` packs offset * 32 + log2(size) of the region of level l in which tet t keeps the nodes
     whose set of nonzero coordinates is the 4-bit mask m (one column where all masks share a region).
-    `dense_ranks[l]` is the collision-free index of each node of level l; only the coarsest levels have it.
+    `dense_ranks` holds, for the coarsest levels one after another, a collision-free number for every node of
+    the grid; the others hash.
     """
 
     starts: Int[Array, " L+1"]  # first entry of each level, and the number of entries
     regions: Int[Array, "L T masks"]
     multipliers: UInt[Array, "T 4"]  # hash factor of each corner
     corner_order: Int[Array, "T 4"]  # the tet's corners by ascending vertex id
-    dense_ranks: tuple[Int[Array, " nodes"], ...]
+    dense_ranks: Int[Array, " nodes"]
+    rank_starts: Int[Array, " D+1"]  # where the D dense levels begin in `dense_ranks`
 
 
 @struct.dataclass

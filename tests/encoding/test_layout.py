@@ -55,7 +55,7 @@ def test_packed_regions_are_disjoint_on_a_larger_mesh(layout_name):
     layout = build_layout(tets, config)
     for level in range(7):
         regions = np.asarray(layout.regions[level])
-        dense = level < len(layout.dense_ranks)
+        dense = oracles.is_dense(layout, level)
         unique = np.unique(regions)
         starts, sizes = unique >> SIZE_BITS, 1 << (unique & ((1 << SIZE_BITS) - 1))
         ends = starts + (1 if dense else sizes)
@@ -74,7 +74,7 @@ def test_dense_levels_are_collision_free_and_full(layout_name, interpolation):
     order = np.asarray(layout.corner_order)
     dense = 0
     for level, resolution in enumerate(config.resolutions):
-        if layout.dense_ranks[level] is None:
+        if not oracles.is_dense(layout, level):
             continue
         dense += 1
         used = {}

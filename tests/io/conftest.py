@@ -72,6 +72,7 @@ def impostor(rng):
         multipliers=jnp.array([[1, 2654435761, 4294967295, 0]], jnp.uint32),
         corner_order=jnp.array([[3, 1, 0, 2]]),
         dense_ranks=(None, jnp.arange(3), jnp.zeros((2, 0), jnp.int32)),
+        rank_starts=jnp.array([0]),
     )
     decoders = {
         "density": [{"kernel": floats[None], "bias": jnp.ones((1, 2), jnp.bfloat16)}],

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int, UInt
 
+from nimpostor_jax.chunks import default_chunk, for_chunks, pad_items, put, take
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.layout import SIZE_BITS
 from nimpostor_jax.types import HashLayout, HashTables
@@ -42,29 +43,100 @@ def encode(
     config: EncodingConfig,
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
+    num_used: Int[Array, ""] | int | None = None,
 ) -> Float[Array, "M L*F"]:
     """Features f_p of points given by tet and barycentric coordinates, all levels concatenated (Eq. 6).
 
-    Differentiable in the tables and, between grid nodes, in the coordinates, in reverse mode.
+    Differentiable in the tables and, between grid nodes, in the coordinates, in reverse mode. Where only the
+    first `num_used` points matter, no more than their chunks are computed; the rest is 0.
     """
-    layout = tables.layout
-    plan = _Plan(
-        tet_ids=tet_ids,
-        multipliers=tuple(layout.multipliers[:, i][tet_ids] for i in range(4)),
-        layout=layout,
-    )
-    coordinates = _canonical(layout, config, tet_ids, lambdas)
-    levels = _interpolate_levels(config, tables.features, coordinates, plan)
-    return levels.reshape(tet_ids.shape[0], config.feature_dim)
+    num_points = tet_ids.shape[0]
+    chunk = default_chunk(num_points)
+    used = jnp.asarray(num_points if num_used is None else num_used, jnp.int32)
+    tet_ids, lambdas = pad_items((tet_ids, lambdas), chunk)
+    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used)[:num_points]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _encode(
+    config: EncodingConfig,
+    chunk: int,
+    features: Float[Array, "entries F"],
+    layout: HashLayout,
+    tet_ids: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
+    num_used: Int[Array, ""],
+) -> Float[Array, "M L*F"]:
+    """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best."""
+
+    def encode_chunk(start: Array, out: Array) -> Array:
+        points = _points(layout, take(tet_ids, start, chunk))
+        coordinates = _canonical(layout, config, points.tet_ids, take(lambdas, start, chunk))
+
+        def add_level(level: Array, corners: _CornersOf, address: _AddressOf, part: Array) -> Array:
+            weights, nodes = corners(coordinates)
+            rows = (_rows(features, address(node)) for node in nodes)
+            total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
+            return jax.lax.dynamic_update_index_in_dim(part, total, level, 1)
+
+        part = jnp.zeros((chunk, config.num_levels, features.shape[1]), features.dtype)
+        part = _for_levels(config, layout, points, add_level, part)
+        return put(out, start, part.reshape(chunk, -1))
+
+    shape = (tet_ids.shape[0], config.num_levels * features.shape[1])
+    return for_chunks(num_used, chunk, encode_chunk, jnp.zeros(shape, features.dtype))
+
+
+def _encode_forward(config: EncodingConfig, chunk: int, *arguments: Any) -> tuple[Array, tuple]:
+    return _encode(config, chunk, *arguments), arguments
+
+
+def _encode_backward(
+    config: EncodingConfig, chunk: int, residuals: tuple, cotangent: Float[Array, "M L*F"]
+) -> tuple:
+    features, layout, tet_ids, lambdas, num_used = residuals
+
+    def encode_chunk(start: Array, sums: tuple) -> tuple:
+        d_features, d_lambdas = sums
+        points = _points(layout, take(tet_ids, start, chunk))
+        canonical = partial(_canonical, layout, config, points.tet_ids)
+        coordinates, pull_coordinates = jax.vjp(canonical, take(lambdas, start, chunk))
+        d_part = take(cotangent, start, chunk).reshape(chunk, config.num_levels, -1)
+
+        def add_level(level: Array, corners: _CornersOf, address: _AddressOf, sums: tuple) -> tuple:
+            d_features, d_coordinates = sums
+            weights, pull, nodes = jax.vjp(corners, coordinates, has_aux=True)
+            d_level = jax.lax.dynamic_index_in_dim(d_part, level, 1, keepdims=False)
+            d_weights = []
+            for weight, node in zip(weights, nodes, strict=True):
+                entries = address(node)
+                d_weights.append(jnp.sum(_rows(features, entries) * d_level, axis=-1).astype(weight.dtype))
+                d_rows = weight[:, None] * d_level
+                d_features = d_features.at[entries].add(d_rows, mode="promise_in_bounds")
+            return d_features, jax.tree.map(jnp.add, d_coordinates, *pull(d_weights))
+
+        zeros = jax.tree.map(jnp.zeros_like, coordinates)
+        d_features, d_coordinates = _for_levels(config, layout, points, add_level, (d_features, zeros))
+        return d_features, put(d_lambdas, start, *pull_coordinates(d_coordinates))
+
+    zeros = jax.tree.map(jnp.zeros_like, (features, lambdas))
+    d_features, d_lambdas = for_chunks(num_used, chunk, encode_chunk, zeros)
+    return d_features, None, None, d_lambdas, None
+
+
+_encode.defvjp(_encode_forward, _encode_backward)
 
 
 @struct.dataclass
-class _Plan:
-    """What all levels need to address a point's nodes."""
+class _Points:
+    """What addresses need of a chunk's points at every level."""
 
     tet_ids: Int[Array, " M"]
     multipliers: tuple[UInt[Array, " M"], ...]  # of the tet's four corners
-    layout: HashLayout
+
+
+def _points(layout: HashLayout, tet_ids: Int[Array, " M"]) -> _Points:
+    return _Points(tet_ids=tet_ids, multipliers=tuple(layout.multipliers[:, i][tet_ids] for i in range(4)))
 
 
 def _canonical(
@@ -88,66 +160,23 @@ def _canonical(
     return tuple(columns)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _interpolate_levels(
-    config: EncodingConfig, features: Float[Array, "entries F"], coordinates: Coordinates, plan: _Plan
-) -> Float[Array, "M L F"]:
-    """Weighted sums of table rows; one gather a corner, accumulated, is what XLA's CPU back end does best."""
-
-    def add_level(level: Array, corners: _CornersOf, address: _AddressOf, out: Array) -> Array:
-        weights, nodes = corners(coordinates)
-        total = sum(w[:, None] * _rows(features, address(u)) for w, u in zip(weights, nodes, strict=True))
-        return jax.lax.dynamic_update_index_in_dim(out, total, level, 1)
-
-    shape = (plan.tet_ids.shape[0], config.num_levels, features.shape[1])
-    return _for_levels(config, plan, add_level, jnp.zeros(shape, features.dtype))
-
-
-def _interpolate_levels_forward(
-    config: EncodingConfig, features: Float[Array, "entries F"], coordinates: Coordinates, plan: _Plan
-) -> tuple[Array, tuple]:
-    return _interpolate_levels(config, features, coordinates, plan), (features, coordinates, plan)
-
-
-def _interpolate_levels_backward(
-    config: EncodingConfig, residuals: tuple, cotangent: Float[Array, "M L F"]
-) -> tuple:
-    features, coordinates, plan = residuals
-
-    def add_level(level: Array, corners: _CornersOf, address: _AddressOf, sums: tuple) -> tuple:
-        d_features, d_coordinates = sums
-        weights, pull, nodes = jax.vjp(corners, coordinates, has_aux=True)
-        d_level = jax.lax.dynamic_index_in_dim(cotangent, level, 1, keepdims=False)
-        d_weights = []
-        for weight, node in zip(weights, nodes, strict=True):
-            entries = address(node)
-            d_weights.append(jnp.sum(_rows(features, entries) * d_level, axis=-1).astype(weight.dtype))
-            d_rows = weight[:, None] * d_level
-            d_features = d_features.at[entries].add(d_rows, mode="promise_in_bounds")
-        return d_features, jax.tree.map(jnp.add, d_coordinates, *pull(d_weights))
-
-    zeros = jax.tree.map(jnp.zeros_like, (features, coordinates))
-    return *_for_levels(config, plan, add_level, zeros), None
-
-
-_interpolate_levels.defvjp(_interpolate_levels_forward, _interpolate_levels_backward)
-
-
 def _rows(features: Float[Array, "entries F"], entries: Int[Array, " M"]) -> Float[Array, "M F"]:
     return features.at[entries].get(mode="promise_in_bounds")
 
 
-def _for_levels(config: EncodingConfig, plan: _Plan, add_level: Callable, carry: Any) -> Any:
+def _for_levels(
+    config: EncodingConfig, layout: HashLayout, points: _Points, add_level: Callable, carry: Any
+) -> Any:
     """Fold `add_level` over the levels: first the densely stored, then the hashed ones."""
     corners = _grid_corners if config.interpolation == "grid" else _simplex_corners
     resolutions = jnp.asarray(config.resolutions, jnp.int32)
-    num_dense = len(plan.layout.dense_ranks)
+    num_dense = layout.rank_starts.shape[0] - 1
 
     def body(level: Array, carry: Any, dense: bool) -> Any:
         resolution = resolutions[level]
         address = _dense_address if dense else _hashed_address
         return add_level(
-            level, partial(corners, resolution), partial(address, plan, level, resolution), carry
+            level, partial(corners, resolution), partial(address, layout, points, level, resolution), carry
         )
 
     carry = jax.lax.fori_loop(0, num_dense, partial(body, dense=True), carry)
@@ -206,34 +235,31 @@ def _cell(scaled: Float[Array, " M"], resolution: Int[Array, ""]) -> Float[Array
 
 
 def _dense_address(
-    plan: _Plan, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
+    layout: HashLayout, points: _Points, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
 ) -> Int[Array, " M"]:
     """Table entries of nodes (four integer coordinates) at a densely stored level."""
-    ranks = plan.layout.dense_ranks
-    starts = jnp.asarray([0, *itertools.accumulate(len(r) for r in ranks)], jnp.int32)
     stride = resolution + 1
     index = ((node[3] * stride + node[2]) * stride + node[1]) * stride + node[0]
-    rank = jnp.concatenate(ranks).at[starts[level] + index].get(mode="promise_in_bounds")
-    return plan.layout.starts[level] + (_region(plan, level, node) >> SIZE_BITS) + rank
+    rank = layout.dense_ranks.at[layout.rank_starts[level] + index].get(mode="promise_in_bounds")
+    return layout.starts[level] + (_region(layout, points, level, node) >> SIZE_BITS) + rank
 
 
 def _hashed_address(
-    plan: _Plan, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
+    layout: HashLayout, points: _Points, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
 ) -> Int[Array, " M"]:
     """Table entries of nodes at a hashed level."""
-    region = _region(plan, level, node)
-    mixed = [u.astype(jnp.uint32) * m for u, m in zip(node, plan.multipliers, strict=True)]
+    region = _region(layout, points, level, node)
+    mixed = [u.astype(jnp.uint32) * m for u, m in zip(node, points.multipliers, strict=True)]
     hashed = (mixed[0] ^ mixed[1]) ^ (mixed[2] ^ mixed[3])
     log2 = (region & ((1 << SIZE_BITS) - 1)).astype(jnp.uint32)
     local = (hashed & ((jnp.uint32(1) << log2) - 1)).astype(jnp.int32)
-    return plan.layout.starts[level] + (region >> SIZE_BITS) + local
+    return layout.starts[level] + (region >> SIZE_BITS) + local
 
 
-def _region(plan: _Plan, level: Int[Array, ""], node: Nodes) -> Int[Array, " M"]:
+def _region(layout: HashLayout, points: _Points, level: Int[Array, ""], node: Nodes) -> Int[Array, " M"]:
     """The packed region of each node: of the tet, or of the sub-simplex that its nonzero coordinates name."""
-    num_masks = plan.layout.regions.shape[2]
-    regions = plan.layout.regions[level].reshape(-1)
-    index = plan.tet_ids * num_masks
+    _, num_tets, num_masks = layout.regions.shape
+    index = (level * num_tets + points.tet_ids) * num_masks
     if num_masks > 1:
         index += sum((u > 0).astype(jnp.int32) << i for i, u in enumerate(node))
-    return regions.at[index].get(mode="promise_in_bounds")
+    return layout.regions.reshape(-1).at[index].get(mode="promise_in_bounds")

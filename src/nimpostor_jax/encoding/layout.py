@@ -52,13 +52,14 @@ def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> HashLa
             f"cannot be addressed (2**31, and 2**{31 - SIZE_BITS} a level); "
             "lower EncodingConfig.min_log2_tet_table or log2_tet_table"
         )
-    num_dense = sum(rank is not None for rank in ranks)  # the coarsest: nodes grow with the resolution
+    dense = [rank for rank in ranks if rank is not None]  # the coarsest levels: nodes grow with them
     return HashLayout(
         starts=jnp.asarray([0, *itertools.accumulate(entries)], jnp.int32),
         regions=jnp.asarray(np.stack(regions), jnp.int32),
         multipliers=jnp.asarray(multipliers, jnp.uint32),
         corner_order=jnp.asarray(order, jnp.int32),
-        dense_ranks=tuple(jnp.asarray(rank, jnp.int32) for rank in ranks[:num_dense]),
+        dense_ranks=jnp.asarray(np.concatenate([*dense, np.zeros(0, np.int64)]), jnp.int32),
+        rank_starts=jnp.asarray([0, *itertools.accumulate(map(len, dense))], jnp.int32),
     )
 
 

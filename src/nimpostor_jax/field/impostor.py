@@ -28,10 +28,13 @@ def init_impostor(key: Array, mesh: TetMesh, config: ImpostorConfig) -> NeuralIm
 
 
 def features(
-    impostor: NeuralImpostor, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+    impostor: NeuralImpostor,
+    tet_ids: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
+    num_used: Int[Array, ""] | None = None,
 ) -> Float[Array, "M C"]:
-    """Position features f_p (Eq. 6)."""
-    return encode(impostor.tables, impostor.config.encoding, tet_ids, lambdas)
+    """Position features f_p (Eq. 6), of the first `num_used` points where given."""
+    return encode(impostor.tables, impostor.config.encoding, tet_ids, lambdas, num_used)
 
 
 def density(

@@ -1,9 +1,12 @@
 """From rays to colours: traverse, sample, encode, decode, composite (Figs. 2 and 4, Eqs. 8 and 9)."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from nimpostor_jax.chunks import map_used
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.render.camera import to_local
@@ -52,10 +55,19 @@ def _integrate(
     if config.visible_per_ray is not None:
         max_samples = min(max_samples, VISIBLE_SPREAD * config.visible_per_ray)
         samples = _visible(impostor, samples, config, max_samples)
-    point_features = field.features(impostor, samples.tet_ids, samples.lambdas)
-    sigmas = field.density(impostor, samples.tet_ids, point_features)
-    directions = field.encode_directions(impostor, rays.directions)[samples.rays]
-    colors = field.radiance(impostor, samples.tet_ids, point_features, directions)
+    num_used = jnp.sum(samples.counts)
+    point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used)
+    directions = field.encode_directions(impostor, rays.directions)
+
+    def decode(shared: tuple, part: tuple) -> tuple[Array, Array]:
+        (decoders, directions), (tet_ids, features, rays) = shared, part
+        sigmas = field.density(decoders, tet_ids, features)
+        return sigmas, field.radiance(decoders, tet_ids, features, directions[rays])
+
+    # Without tables and mesh, or `map_used` would add up gradients of their size for every chunk.
+    decoders = dataclasses.replace(impostor, mesh=None, tables=None)  # type: ignore[arg-type]
+    items = (samples.tet_ids, point_features, samples.rays)
+    sigmas, colors = map_used(decode, (decoders, directions), items, num_used)
 
     def grid(values: Float[Array, "M *rest"]) -> Float[Array, "R S *rest"]:
         return to_grid(values, samples, max_samples)
@@ -80,8 +92,12 @@ def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig, m
     Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
     """
     frozen, seen = jax.lax.stop_gradient((impostor, samples))
-    point_features = field.features(frozen, seen.tet_ids, seen.lambdas)
-    sigmas = field.density(frozen, seen.tet_ids, point_features)
+
+    def densities(frozen: NeuralImpostor, part: tuple) -> Array:
+        tet_ids, lambdas = part
+        return field.density(frozen, tet_ids, field.features(frozen, tet_ids, lambdas))
+
+    sigmas = map_used(densities, frozen, (seen.tet_ids, seen.lambdas), jnp.sum(seen.counts))
     max_samples = config.sampler.max_samples_per_ray
     weights = sample_weights(to_grid(sigmas, seen, max_samples), to_grid(seen.deltas, seen, max_samples))
     keep = from_grid(weights, seen) >= config.min_weight

@@ -1,0 +1,115 @@
+"""Work in proportion to what fixed-size buffers hold: chunks of their used part, one after another.
+
+Shapes are static, so a buffer has room for the worst case; a loop with a traced bound over chunks of it
+computes the rest of the chunk in which the used part ends, and nothing beyond. On a CPU a chunk's arrays
+also stay in the cache. Axis: M items, used ones first.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Int
+
+CPU_CHUNK = 8192  # items; accelerators want few large kernels and take all at once
+
+
+def default_chunk(num_items: int) -> int:
+    """Items a chunk on this back end, at least 1."""
+    return max(1, min(num_items, CPU_CHUNK) if jax.default_backend() == "cpu" else num_items)
+
+
+def padded_size(num_items: int, chunk: int) -> int:
+    """The next multiple of the chunk's size."""
+    return -(-num_items // chunk) * chunk
+
+
+def pad_items(items: Any, chunk: int) -> Any:
+    """Arrays [M, ...] with zeros up to a multiple of the chunk's size."""
+    return jax.tree.map(lambda x: _pad(x, padded_size(x.shape[0], chunk)), items)
+
+
+def _pad(x: Array, size: int) -> Array:
+    return jnp.pad(x, [(0, size - x.shape[0])] + [(0, 0)] * (x.ndim - 1))
+
+
+def for_chunks(
+    num_used: Int[Array, ""], chunk: int, body: Callable[[Int[Array, ""], Any], Any], carry: Any
+) -> Any:
+    """Fold `body(start, carry)` over the chunks that hold the first `num_used` items."""
+    num_chunks = (num_used + chunk - 1) // chunk
+    return jax.lax.fori_loop(0, num_chunks, lambda i, carry: body(i * chunk, carry), carry)
+
+
+def take(items: Any, start: Int[Array, ""], chunk: int) -> Any:
+    """The chunk of arrays [M, ...] that begins at `start`."""
+    return jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, start, chunk), items)
+
+
+def put(items: Any, start: Int[Array, ""], values: Any) -> Any:
+    """Arrays [M, ...] with the chunk at `start` replaced."""
+    return jax.tree.map(lambda x, v: jax.lax.dynamic_update_slice_in_dim(x, v, start, 0), items, values)
+
+
+def map_used(
+    function: Callable[[Any, Any], Any],
+    shared: Any,
+    items: Any,
+    num_used: Int[Array, ""],
+    chunk: int | None = None,
+) -> Any:
+    """`function(shared, items)` of arrays [M, ...] in chunks, for the first `num_used` items.
+
+    `function` maps items one by one and closes over no traced value. What stands beyond the last chunk
+    computed is 0. Differentiable in reverse mode in the floating-point leaves of `shared` and `items`: the
+    backward pass computes the function again, chunk by chunk, so that nothing but its arguments is kept.
+    """
+    num_items = jax.tree.leaves(items)[0].shape[0]
+    chunk = chunk or default_chunk(num_items)
+    result = _map_used(function, chunk, shared, pad_items(items, chunk), num_used)
+    return jax.tree.map(lambda x: x[:num_items], result)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _map_used(function: Callable, chunk: int, shared: Any, items: Any, num_used: Array) -> Any:
+    def body(start: Array, results: Any) -> Any:
+        return put(results, start, function(shared, take(items, start, chunk)))
+
+    shapes = jax.eval_shape(function, shared, items)
+    return for_chunks(num_used, chunk, body, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
+
+
+def _map_used_forward(
+    function: Callable, chunk: int, shared: Any, items: Any, num_used: Array
+) -> tuple[Any, tuple]:
+    return _map_used(function, chunk, shared, items, num_used), (shared, items, num_used)
+
+
+def _map_used_backward(function: Callable, chunk: int, residuals: tuple, cotangents: Any) -> tuple:
+    shared, items, num_used = residuals
+    (d_shared, fixed), (d_items, fixed_items) = _split(shared), _split(items)
+
+    def body(start: Array, sums: tuple) -> tuple:
+        part, fixed_part = take((d_items, fixed_items), start, chunk)
+        _, pull = jax.vjp(lambda s, p: function(_join(s, fixed), _join(p, fixed_part)), d_shared, part)
+        of_shared, of_part = pull(take(cotangents, start, chunk))
+        return jax.tree.map(jnp.add, sums[0], of_shared), put(sums[1], start, of_part)
+
+    zeros = jax.tree.map(jnp.zeros_like, (d_shared, d_items))
+    return *for_chunks(num_used, chunk, body, zeros), None
+
+
+_map_used.defvjp(_map_used_forward, _map_used_backward)
+
+
+def _split(tree: Any) -> tuple[Any, Any]:
+    """The floating-point leaves, and the others; each with None in the place of the other's."""
+    floats = jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jnp.inexact) else None, tree)
+    others = jax.tree.map(lambda x: None if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree)
+    return floats, others
+
+
+def _join(floats: Any, others: Any) -> Any:
+    return jax.tree.map(lambda x, y: y if x is None else x, floats, others, is_leaf=lambda x: x is None)

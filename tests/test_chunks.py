@@ -1,0 +1,61 @@
+"""chunks: the used part of a buffer, chunk by chunk."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from nimpostor_jax.chunks import map_used
+
+
+def scale_and_pick(shared, items):
+    factor, table = shared
+    values, index = items
+    return jnp.sin(values) * factor, values[:, 0] * table[index]
+
+
+def scene(rng, count):
+    shared = (jnp.asarray(rng.normal(size=3)), jnp.asarray(rng.normal(size=5)))
+    items = (jnp.asarray(rng.normal(size=(count, 3))), jnp.asarray(rng.integers(0, 5, count), jnp.int32))
+    return shared, items
+
+
+@pytest.mark.parametrize("count, used, chunk", [(10, 10, 4), (10, 7, 4), (8, 0, 4), (3, 3, 8), (12, 4, 4)])
+def test_equals_the_plain_function_on_the_used_items(count, used, chunk, x64, rng):
+    shared, items = scene(rng, count)
+    mapped = jax.jit(lambda s, i, n: map_used(scale_and_pick, s, i, n, chunk))(shared, items, used)
+    computed = min(count, -(-used // chunk) * chunk)
+    for ours, plain in zip(mapped, scale_and_pick(shared, items), strict=True):
+        assert_array_equal(ours[:used], plain[:used])
+        assert_array_equal(ours[computed:], 0)  # nothing is done for the chunks beyond
+
+
+def test_gradients_equal_those_of_the_plain_function(x64, rng):
+    shared, items = scene(rng, 10)
+    used, mix = 7, jnp.asarray(rng.normal(size=(10, 3)))
+
+    def total(function):
+        def of(shared, values):
+            first, second = function(shared, (values, items[1]))
+            return jnp.sum((mix * first)[:used]) + jnp.sum((second**2)[:used])
+
+        return jax.jit(jax.grad(of, argnums=(0, 1)))(shared, items[0])
+
+    ours = total(lambda s, i: map_used(scale_and_pick, s, i, jnp.int32(used), 4))
+    plain = total(scale_and_pick)
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(plain), strict=True):
+        assert_allclose(a, b, atol=1e-14)  # sums in another order
+
+
+def test_the_number_used_does_not_recompile(rng):
+    traces = []
+
+    @jax.jit
+    def mapped(items, used):
+        traces.append(1)
+        return map_used(lambda _, x: x + 1, None, items, used, 4)
+
+    results = [np.asarray(mapped(jnp.zeros(12), used)) for used in (0, 3, 12)]
+    assert [int(r.sum()) for r in results] == [0, 4, 12]
+    assert len(traces) == 1
