@@ -27,7 +27,7 @@ FIELD = ImpostorConfig(
 RENDER = RenderConfig(
     march=MarchConfig(max_tets_per_ray=8, max_entries_per_ray=2),
     sampler=SamplerConfig(step=0.5, max_samples_per_ray=16),
-    visible_per_ray=None,
+    min_weight=0.0,
 )
 
 

@@ -176,19 +176,10 @@ class RenderConfig:
     sampler: SamplerConfig = SamplerConfig()
     density_measure: Literal["barycentric", "euclidean"] = "barycentric"  # Eq. 9 or Eq. 8
     near: float = 0.0  # in world units
-    min_weight: float = 1e-4  # samples that contribute less are neither decoded nor trained
-    visible_per_ray: int | None = (
-        16  # mean samples a ray above `min_weight`; None: decode all samples
-    )
+    min_weight: float = 1e-4  # samples that contribute less get no colour and no gradient; 0: all do
 
     def __post_init__(self) -> None:
         _require(0 <= self.min_weight < 1, self, "min_weight", "in [0, 1)")
-        _require(
-            self.visible_per_ray is None or self.visible_per_ray >= 1,
-            self,
-            "visible_per_ray",
-            "None or >= 1",
-        )
         _require(
             self.density_measure in ("barycentric", "euclidean"),
             self,

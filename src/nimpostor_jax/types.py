@@ -121,4 +121,3 @@ class RenderOutput:
     depth: Float[Array, "*batch"]  # expected distance in world units; 0 where opacity is 0
     overflow: Bool[Array, "*batch"]
     coarsened: Bool[Array, "*batch"]
-    num_visible: Int[Array, "*batch"]  # samples that deserve decoding, also where they did not fit

@@ -179,7 +179,6 @@ def _grow(config: RenderConfig) -> RenderConfig:
     return dataclasses.replace(
         grow_march(config),
         sampler=dataclasses.replace(sampler, capacity_per_ray=capacity),
-        visible_per_ray=None if config.visible_per_ray is None else min(most, 2 * config.visible_per_ray),
     )
 
 

@@ -1,6 +1,7 @@
 """Volume rendering quadrature (Eq. 1, with the transmittance's sum made exclusive).
 
-Axes: R rays, S samples. Units: `sigmas` per unit of the density measure, `deltas` in that measure.
+Axes: S samples of a ray. The optical depth of an interval is its density, per unit of the density measure,
+times its length in that measure.
 """
 
 import jax.numpy as jnp
@@ -13,11 +14,8 @@ def transmittance(optical_depth: Float[Array, "*batch S"]) -> Float[Array, "*bat
     return jnp.exp(-jnp.concatenate([jnp.zeros_like(optical_depth[..., :1]), before], axis=-1))
 
 
-def sample_weights(
-    sigmas: Float[Array, "*batch S"], deltas: Float[Array, "*batch S"]
-) -> Float[Array, "*batch S"]:
+def sample_weights(optical_depth: Float[Array, "*batch S"]) -> Float[Array, "*batch S"]:
     """Share of the ray's light that each interval contributes: T_i (1 - exp(-sigma_i delta_i))."""
-    optical_depth = sigmas * deltas
     return transmittance(optical_depth) * -jnp.expm1(-optical_depth)
 
 

@@ -56,17 +56,7 @@ def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
         return config
     chosen = hits[np.linspace(0, hits.size - 1, CHUNK).round().astype(int)]
     probe = jax.tree.map(lambda x: x[chosen], rays)
-    config = fit_capacities(impostor.mesh, tables, probe, config)
-    if config.visible_per_ray is None:
-        return config
-    render = _Renderer(impostor, tables)
-    output = render(jax.tree.map(lambda x: np.tile(x, (render.num_devices, 1)), probe), config)
-    mean = 1.25 * float(np.mean(output.num_visible)) + 1
-    if mean <= config.visible_per_ray and np.mean(output.overflow) < REPAIRABLE:
-        return config
-    visible = 8 * int(np.ceil(max(mean, config.visible_per_ray) / 8))
-    most = config.sampler.max_samples_per_ray
-    return dataclasses.replace(config, visible_per_ray=None if 2 * visible > most else visible)
+    return fit_capacities(impostor.mesh, tables, probe, config)
 
 
 def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> Frame:
@@ -160,7 +150,7 @@ def _spread(rays: np.ndarray, chunk: int) -> list[np.ndarray]:
 
 def _grow(config: RenderConfig) -> RenderConfig:
     sampler = dataclasses.replace(config.sampler, capacity_per_ray=None)
-    return dataclasses.replace(grow_march(config), sampler=sampler, visible_per_ray=None)
+    return dataclasses.replace(grow_march(config), sampler=sampler)
 
 
 def to_image(frame: Frame, background: Float[np.ndarray, " 3"] | float = 1.0) -> Float[np.ndarray, "H W 3"]:

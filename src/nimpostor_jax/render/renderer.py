@@ -22,8 +22,6 @@ from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import MarchTables, march_tables, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, RenderOutput
 
-VISIBLE_SPREAD = 4  # one ray may have this many times the mean number of visible samples
-
 
 def render_rays(
     impostor: NeuralImpostor,
@@ -51,10 +49,8 @@ def render_rays(
 def _integrate(
     impostor: NeuralImpostor, rays: Rays, samples: Samples, overflow: Array, config: RenderConfig
 ) -> RenderOutput:
-    max_samples = config.sampler.max_samples_per_ray
-    if config.visible_per_ray is not None:
-        max_samples = min(max_samples, VISIBLE_SPREAD * config.visible_per_ray)
-        samples = _visible(impostor, samples, config, max_samples)
+    if config.min_weight > 0:
+        samples = _visible(impostor, samples, config)
     num_used = jnp.sum(samples.counts)
     point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used)
     directions = field.encode_directions(impostor, rays.directions)
@@ -69,24 +65,31 @@ def _integrate(
     items = (samples.tet_ids, point_features, samples.rays)
     sigmas, colors = map_used(decode, (decoders, directions), items, num_used)
 
-    def grid(values: Float[Array, "M *rest"]) -> Float[Array, "R S *rest"]:
-        return to_grid(values, samples, max_samples)
-
-    weights = sample_weights(grid(sigmas), grid(samples.deltas))
-    opacity = jnp.sum(weights, axis=-1)
-    depth = jnp.sum(weights * grid(samples.t), axis=-1)
+    weights = _weights(sigmas, samples, config)
+    sums = jax.ops.segment_sum(
+        weights[:, None] * jnp.column_stack([colors, jnp.ones_like(weights), samples.t]),
+        samples.rays,
+        num_segments=rays.origins.shape[0],
+        indices_are_sorted=True,
+    )
+    opacity, depth = sums[:, 3], sums[:, 4]
     visible = opacity > 0
     return RenderOutput(
-        color=jnp.sum(weights[..., None] * grid(colors), axis=-2),
+        color=sums[:, :3],
         opacity=opacity,
         depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * impostor.mesh.scale,
         overflow=overflow | samples.overflow,
         coarsened=samples.coarsened,
-        num_visible=samples.wanted,
     )
 
 
-def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig, max_visible: int) -> Samples:
+def _weights(sigmas: Float[Array, " M"], samples: Samples, config: RenderConfig) -> Float[Array, " M"]:
+    """Share of its ray's light that each packed sample contributes."""
+    optical_depth = to_grid(sigmas * samples.deltas, samples, config.sampler.max_samples_per_ray)
+    return from_grid(sample_weights(optical_depth), samples)
+
+
+def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig) -> Samples:
     """The samples that contribute at least `min_weight`, found by a pass over densities without gradient.
 
     Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
@@ -98,9 +101,4 @@ def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig, m
         return field.density(frozen, tet_ids, field.features(frozen, tet_ids, lambdas))
 
     sigmas = map_used(densities, frozen, (seen.tet_ids, seen.lambdas), jnp.sum(seen.counts))
-    max_samples = config.sampler.max_samples_per_ray
-    weights = sample_weights(to_grid(sigmas, seen, max_samples), to_grid(seen.deltas, seen, max_samples))
-    keep = from_grid(weights, seen) >= config.min_weight
-    num_rays = samples.counts.shape[0]
-    capacity = min(num_rays * (config.visible_per_ray or max_samples), samples.t.shape[0])
-    return select_samples(samples, keep, capacity, max_visible)
+    return select_samples(samples, _weights(sigmas, seen, config) >= config.min_weight)

@@ -137,19 +137,15 @@ def _find_segment(
     return jnp.minimum(low, num_slots - 1)
 
 
-def select_samples(samples: Samples, keep: Bool[Array, " M"], capacity: int, max_per_ray: int) -> Samples:
-    """Only the samples to keep, packed into `capacity` slots in the same order.
-
-    `overflow` marks rays some of whose samples did not fit, or which keep more than `max_per_ray`, besides
-    those that had it already.
-    """
-    num_rays = samples.counts.shape[0]
+def select_samples(samples: Samples, keep: Bool[Array, " M"]) -> Samples:
+    """Only the samples to keep, packed at the buffer's start in the same order."""
+    num_rays, capacity = samples.counts.shape[0], samples.t.shape[0]
     keep &= samples.deltas > 0
-    wanted = jnp.zeros(num_rays, jnp.int32).at[samples.rays].add(keep.astype(jnp.int32))
-    firsts = jnp.cumsum(wanted) - wanted
-    counts = jnp.clip(capacity - firsts, 0, wanted)
+    counts = jnp.zeros(num_rays, jnp.int32).at[samples.rays].add(keep.astype(jnp.int32))
+    firsts = jnp.cumsum(counts) - counts
     chosen = jnp.nonzero(keep, size=capacity, fill_value=0)[0]
-    used = jnp.arange(capacity) < jnp.sum(wanted)
+    packed = jnp.arange(capacity, dtype=jnp.int32)
+    used = packed < jnp.sum(counts)
     rays = samples.rays[chosen]
     return Samples(
         tet_ids=samples.tet_ids[chosen],
@@ -157,15 +153,11 @@ def select_samples(samples: Samples, keep: Bool[Array, " M"], capacity: int, max
         t=samples.t[chosen],
         deltas=jnp.where(used, samples.deltas[chosen], 0),
         rays=rays,
-        slots=jnp.where(
-            used,
-            jnp.minimum(jnp.arange(capacity, dtype=jnp.int32) - firsts[rays], max_per_ray - 1),
-            0,
-        ),
+        slots=jnp.where(used, packed - firsts[rays], 0),
         starts=jnp.minimum(firsts, capacity - 1),
         counts=counts,
-        wanted=wanted,
-        overflow=samples.overflow | (counts < wanted) | (wanted > max_per_ray),
+        wanted=samples.wanted,
+        overflow=samples.overflow,
         coarsened=samples.coarsened,
     )
 
