@@ -13,7 +13,7 @@ Axes: R rays, K tet slots, B entries, T tets; inside a tile the rays (lanes) are
 Nothing here is differentiable; `segments.locate_segments` makes differentiable coordinates of the result.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +21,16 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from nimpostor_jax.chunks import for_chunks, padded_size, take
 from nimpostor_jax.config import MarchConfig
-from nimpostor_jax.geometry.intersect import face_weights, passes_left, project, ray_frame
+from nimpostor_jax.geometry.intersect import (
+    face_weights,
+    passes_left,
+    project,
+    quick_face_weights,
+    quick_passes_left,
+    ray_frame,
+)
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.types import Rays, TetMesh
 
@@ -122,54 +130,88 @@ def traverse(tables: MarchTables, rays: Rays, config: MarchConfig) -> Crossings:
         padded = jnp.pad(jax.lax.stop_gradient(x), padding, mode="edge") if num_rays else x
         return padded.reshape(num_tiles, tile, 3).transpose(0, 2, 1)
 
-    codes, ends, overflow = jax.lax.map(
-        lambda rays: _march_tile(tables, config, *rays),
+    codes, ends, overflow, unsure = jax.lax.map(
+        lambda rays: _march_tile(tables, config, False, *rays),
         (tiles(rays.origins), tiles(rays.directions)),
     )
     slots = config.max_tets_per_ray
     codes = codes.transpose(0, 2, 1).reshape(num_tiles * tile, slots)
     ends = ends.transpose(2, 0, 3, 1).reshape(6, num_tiles * tile, slots)
-    return Crossings(
+    crossings = Crossings(
         codes=codes[:num_rays], ends=ends[:, :num_rays], overflow=overflow.reshape(-1)[:num_rays]
     )
+    return _march_again(tables, rays, config, crossings, unsure.reshape(-1)[:num_rays], tile)
+
+
+def _march_again(
+    tables: MarchTables,
+    rays: Rays,
+    config: MarchConfig,
+    crossings: Crossings,
+    unsure: Bool[Array, " R"],
+    tile: int,
+) -> Crossings:
+    """The crossings, with those of unsure rays from careful marches: rare, and several times slower."""
+    num_rays = unsure.shape[0]
+    lines = jax.lax.stop_gradient((rays.origins, rays.directions))
+    again = jnp.nonzero(unsure, size=padded_size(num_rays, tile), fill_value=num_rays)[0]
+
+    def march(start: Array, found: Crossings) -> Crossings:
+        chosen = take(again, start, tile)  # past the end: read the last ray, write nothing
+        origins, directions = (x.at[chosen].get(mode="clip").T for x in lines)
+        codes, ends, overflow, _ = _march_tile(tables, config, True, origins, directions)
+        return Crossings(
+            codes=found.codes.at[chosen].set(codes.T, mode="drop"),
+            ends=found.ends.at[:, chosen].set(ends.transpose(1, 2, 0), mode="drop"),
+            overflow=found.overflow.at[chosen].set(overflow, mode="drop"),
+        )
+
+    return for_chunks(jnp.sum(unsure, dtype=jnp.int32), tile, march, crossings) if num_rays else crossings
 
 
 def _march_tile(
     tables: MarchTables,
     config: MarchConfig,
+    careful: bool,
     origins: Float[Array, "3 lanes"],
     directions: Float[Array, "3 lanes"],
-) -> tuple[Int[Array, "K lanes"], Float[Array, "K 6 lanes"], Bool[Array, " lanes"]]:
+) -> tuple[Int[Array, "K lanes"], Float[Array, "K 6 lanes"], Bool[Array, " lanes"], Bool[Array, " lanes"]]:
+    """Codes and ends, overflow, and the lanes on which tests were too close for the quick way."""
     # One rounding of the axes for all kernels below, for the reason that `project` gives.
     origin, axes = tuple(origins), jax.lax.optimization_barrier(ray_frame(tuple(directions)))
-    entry_holds, num_entries = _find_entries(tables, config, origin, axes)
+    entry_holds, num_entries, unsure = _find_entries(tables, config, careful, origin, axes)
 
     lanes, slots = origins.shape[1], config.max_tets_per_ray
 
     def held_triangle(
         hold: Int[Array, " lanes"],
     ) -> tuple[Float[Array, "3 3 lanes"], Float[Array, "3 lanes"]]:
-        """The face that is entered, projected from scratch (at the cage's boundary), and where it is met."""
+        """The face that is entered, projected from scratch (at the cage's boundary), and where it is met.
+
+        Whether it is seen edge-on has been noted when it was found.
+        """
         face = hold // 3
         held = jnp.asarray(FACES, jnp.int32)[face & 3]  # boundary faces are held unrotated
         points = [project(tuple(tables.corners[:, (face & ~3) + held[:, j]]), origin, axes) for j in range(3)]
-        return jnp.stack([jnp.stack(point) for point in points]), _met(*points)
+        met, _ = _met(points[0], points[1], points[2], careful)
+        return jnp.stack([jnp.stack(point) for point in points]), met
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
         return (state[0] < slots) & jnp.any(state[1] >= 0)
 
     def step(state: tuple) -> tuple:
-        slot, hold, points, met, entry, codes, ends = state
+        slot, hold, points, met, entry, codes, ends, unsure = state
         active = hold >= 0
         new = jnp.stack(project(tuple(tables.corners[:, jnp.maximum(hold, 0) // 3]), origin, axes))
-        left = [passes_left(tuple(new), tuple(points[j])) for j in range(3)]
+        left, close = _sides(((tuple(new), tuple(points[j])) for j in range(3)), careful)
         # The way out is the new vertex's triangle around the ray: right of one held corner, left of the next.
         # If rounding leaves none (a sliver seen edge-on), any other face than the entry advances.
         exit_slot = jnp.where(~left[1] & left[2], 0, jnp.where(~left[2] & left[0], 1, 2))
         code = jnp.where(active, 3 * hold + exit_slot, -1)
         first = jnp.where(exit_slot == 0, points[1], jnp.where(exit_slot == 1, points[2], points[0]))
         second = jnp.where(exit_slot == 0, points[2], jnp.where(exit_slot == 1, points[0], points[1]))
-        met_after = _met(tuple(new), tuple(first), tuple(second))
+        met_after, flat = _met(tuple(new), tuple(first), tuple(second), careful)
+        unsure |= active & (close[0] | close[1] | close[2] | flat)
         codes = jax.lax.dynamic_update_index_in_dim(codes, code, slot, 0)
         ends = jax.lax.dynamic_update_index_in_dim(ends, jnp.concatenate([met, met_after]), slot, 0)
 
@@ -185,7 +227,7 @@ def _march_tile(
             return jnp.where(reenters, triangle, points), jnp.where(reenters, met_again, met_after)
 
         points, met = jax.lax.cond(jnp.any(reenters), reenter, lambda: (points, met_after))
-        return slot + 1, hold, points, met, entry, codes, ends
+        return slot + 1, hold, points, met, entry, codes, ends, unsure
 
     start = (
         jnp.zeros((), jnp.int32),
@@ -194,58 +236,78 @@ def _march_tile(
         jnp.ones(lanes, jnp.int32),  # the next entry to take
         jnp.full((slots, lanes), -1, jnp.int32),
         jnp.zeros((slots, 6, lanes), origins.dtype),
+        unsure,
     )
-    _, hold, _, _, _, codes, ends = jax.lax.while_loop(unfinished, step, start)
-    return codes, ends, (hold >= 0) | (num_entries > config.max_entries_per_ray)
+    _, hold, _, _, _, codes, ends, unsure = jax.lax.while_loop(unfinished, step, start)
+    return codes, ends, (hold >= 0) | (num_entries > config.max_entries_per_ray), unsure
 
 
-def _met(a: Sequence[Array], b: Sequence[Array], c: Sequence[Array]) -> Float[Array, "3 lanes"]:
-    """t at which the line meets a projected triangle, and the weights of its first two corners there."""
-    wa, wb, wc = face_weights(a, b, c)
-    return jnp.stack([wa * a[2] + wb * b[2] + wc * c[2], wa, wb])
+def _sides(edges: Iterable[tuple], careful: bool) -> tuple[list[Array], list[Array]]:
+    """`passes_left` of each edge, and where that may be wrong."""
+    if careful:
+        sides = [passes_left(*edge) for edge in edges]
+        return sides, [jnp.zeros_like(side) for side in sides]
+    quick = [quick_passes_left(*edge) for edge in edges]
+    return [left for left, _ in quick], [close for _, close in quick]
+
+
+def _met(
+    a: Sequence[Array], b: Sequence[Array], c: Sequence[Array], careful: bool
+) -> tuple[Float[Array, "3 lanes"], Bool[Array, " lanes"]]:
+    """t at which the line meets a projected triangle, the weights of its first two corners, and doubt."""
+    if careful:
+        (wa, wb, wc), flat = face_weights(a, b, c), jnp.zeros(a[0].shape, bool)
+    else:
+        (wa, wb, wc), flat = quick_face_weights(a, b, c)
+    return jnp.stack([wa * a[2] + wb * b[2] + wc * c[2], wa, wb]), flat
 
 
 def _find_entries(
-    tables: MarchTables, config: MarchConfig, origin: tuple, axes: tuple
-) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"]]:
-    """The front-facing boundary faces on each lane's line by t: their holds (-1 pads) and count."""
+    tables: MarchTables, config: MarchConfig, careful: bool, origin: tuple, axes: tuple
+) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"], Bool[Array, " lanes"]]:
+    """The front-facing boundary faces on each lane's line by t: their holds (-1 pads), count, and doubt."""
     lanes, slots = origin[0].shape[0], config.max_entries_per_ray
     dtype = origin[0].dtype
     clusters, width = tables.face_holds.shape
     words = _pack_bits(_near_clusters(tables, origin, axes[2]))
 
     def test_face(i: Int[Array, ""], state: tuple) -> tuple:
-        cluster, found = state
+        cluster, unsure, found = state
         hold = tables.face_holds[cluster, i]
         a, b, c = (project(tuple(corner), origin, axes) for corner in tables.face_corners[cluster, i])
         # Counter-clockwise from outside is clockwise along a ray that comes from outside.
-        hit = (hold >= 0) & ~passes_left(a, b) & ~passes_left(b, c) & ~passes_left(c, a)
-        wa, wb, wc = face_weights(a, b, c)
-        t = jnp.where(hit, wa * a[2] + wb * b[2] + wc * c[2], jnp.inf)
-        return cluster, jax.lax.cond(jnp.any(hit), lambda: _insert(found, t, hold), lambda: found)
+        left, close = _sides(((a, b), (b, c), (c, a)), careful)
+        hit, possible = (hold >= 0) & ~left[0] & ~left[1] & ~left[2], hold >= 0
+        for passed, doubt in zip(left, close, strict=True):
+            possible &= ~passed | doubt
+        met, flat = _met(a, b, c, careful)
+        t = jnp.where(hit, met[0], jnp.inf)
+        unsure |= (possible & (close[0] | close[1] | close[2])) | (hit & flat)
+        return cluster, unsure, jax.lax.cond(jnp.any(hit), lambda: _insert(found, t, hold), lambda: found)
 
     def test_next_cluster(state: tuple) -> tuple:
-        word, bits, found = state
+        word, bits, unsure, found = state
         lowest = jax.lax.population_count(~bits & (bits - 1)).astype(jnp.int32)
         cluster = jnp.minimum(32 * word + lowest, clusters - 1)
-        found = jax.lax.cond(
+        unsure, found = jax.lax.cond(
             bits != 0,
-            lambda: jax.lax.fori_loop(0, width, test_face, (cluster, found))[1],
-            lambda: found,
+            lambda: jax.lax.fori_loop(0, width, test_face, (cluster, unsure, found))[1:],
+            lambda: (unsure, found),
         )
         bits = bits & (bits - 1)
         word = jnp.where(bits == 0, word + 1, word)
         bits = jnp.where(bits == 0, words[jnp.minimum(word, len(words) - 1)], bits)
-        return word, bits, found
+        return word, bits, unsure, found
 
     empty = (
         jnp.full((slots, lanes), jnp.inf, dtype),
         jnp.full((slots, lanes), -1, jnp.int32),
         jnp.zeros(lanes, jnp.int32),
     )
-    start = (jnp.zeros((), jnp.int32), words[0], empty)
-    _, _, (_, holds, count) = jax.lax.while_loop(lambda s: s[0] < len(words), test_next_cluster, start)
-    return holds, count
+    start = (jnp.zeros((), jnp.int32), words[0], jnp.zeros(lanes, bool), empty)
+    end = jax.lax.while_loop(lambda s: s[0] < len(words), test_next_cluster, start)
+    _, _, unsure, (_, holds, count) = end
+    return holds, count, unsure
 
 
 def _near_clusters(tables: MarchTables, origin: tuple, direction: tuple) -> Bool[Array, " clusters"]:

@@ -1,0 +1,194 @@
+"""Run time of a frame against its error, for every setting that trades one for the other.
+
+    python experiments/pareto.py --data=DIR --workdir=out/mic --out=out/pareto
+
+On a trained impostor, at the resolution of its data. The error is that to a converged float64 quadrature of
+the same field (steps of `REFERENCE_STEP`, nothing left out); the PSNR is that to the held-out images. Writes
+`pareto.csv`, `pareto.json` and `pareto.png`. Settings take turns, so that a slow minute of the machine hits
+all of them; times are medians without compilation.
+"""
+
+import argparse
+import csv
+import dataclasses
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import matplotlib
+import numpy as np
+from tqdm import tqdm
+
+from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.io.atomic import atomic_path
+from nimpostor_jax.io.blender import load_scene
+from nimpostor_jax.io.impostor_file import load_impostor
+from nimpostor_jax.io.scenes import resolve_scene
+from nimpostor_jax.metrics import psnr
+from nimpostor_jax.pipeline.evaluate import camera_of, write_json
+from nimpostor_jax.pipeline.prepare import use_all_cores
+from nimpostor_jax.render.frame import Frame, frame_config, render_frame, to_image
+from nimpostor_jax.types import Camera, NeuralImpostor
+
+matplotlib.use("Agg")
+from matplotlib import pyplot as plt
+
+Row = dict[str, Any]
+
+REFERENCE_STEP = 1 / 128
+REFERENCE_SAMPLES = 2048
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", required=True, help="a nerf-synthetic folder, or a built-in scene")
+    parser.add_argument("--workdir", required=True, type=Path, help="of a training run")
+    parser.add_argument("--out", type=Path, default=Path("out/pareto"), help="folder")
+    parser.add_argument("--views", type=int, default=3, help="held-out views, spread over all")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--only", action="append", help="lever to vary (repeatable); default: all")
+    add_flags(parser)
+    args = parser.parse_args(argv)
+    use_all_cores()
+    config = load_config([args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or [])
+    impostor = load_impostor(args.workdir / "impostor.npz")
+    _, test = load_scene(resolve_scene(args.data), config.data)
+    views = np.linspace(0, len(test.images) - 1, min(args.views, len(test.images))).round().astype(int)
+    cameras = [camera_of(test, view) for view in views]
+    background = 1.0 if config.data.background == "white" else 0.0
+    truths = [test.images[v][..., :3] + background * (1 - test.images[v][..., 3:]) for v in views]
+    settings = [s for s in levers(config.render) if not args.only or s[0] in [*args.only, "default"]]
+
+    references = [
+        to_image(reference_frame(impostor, camera, config.render), background) for camera in cameras
+    ]
+    rows = []
+    for lever, value, render in settings:
+        render = frame_config(impostor, cameras[0], render)
+        images = [to_image(render_frame(impostor, camera, render), background) for camera in cameras]
+        error = np.abs(np.array(images) - np.array(references))
+        rows.append(
+            {
+                "lever": lever,
+                "value": value,
+                "ms": [],
+                "max_error": float(error.max()),
+                "mean_error": float(error.mean()),
+                "psnr_to_reference": mean_psnr(images, references),
+                "psnr": mean_psnr(images, truths),
+                "render": render,
+            }
+        )
+    for _ in tqdm(range(args.repeats), desc="timing", disable=None):
+        for row in rows:
+            start = time.perf_counter()
+            for camera in cameras:
+                render_frame(impostor, camera, row["render"])
+            row["ms"].append(1e3 * (time.perf_counter() - start) / len(cameras))
+    for row in rows:
+        row["ms"] = float(np.median(row["ms"]))
+        del row["render"]
+    mark_front(rows)
+    args.out.mkdir(parents=True, exist_ok=True)
+    write_table(args.out / "pareto.csv", rows)
+    size = f"{cameras[0].width} x {cameras[0].height}"
+    about = {
+        "scene": str(args.data),
+        "size": size,
+        "views": views.tolist(),
+        "device": jax.devices()[0].device_kind,
+        "reference_psnr": mean_psnr(references, truths),  # no quadrature does better, but for chance
+    }
+    write_json(args.out / "pareto.json", about | {"rows": rows})
+    plot(args.out / "pareto.png", rows, f"{Path(args.data).name}, {size}")
+    for row in rows:
+        print(
+            f"{'*' if row['front'] else ' '} {row['lever']:12s} {row['value']!s:12s} {row['ms']:8.0f} ms  "
+            f"error max {row['max_error']:.4f} mean {row['mean_error']:.6f} "
+            f"({row['psnr_to_reference']:.2f} dB)  PSNR {row['psnr']:.2f} dB"
+        )
+    print(f"converged quadrature: PSNR {about['reference_psnr']:.2f} dB; wrote {args.out}")
+
+
+def levers(base: RenderConfig) -> list[tuple[str, Any, RenderConfig]]:
+    """(lever, value, config): the given config, and it with one field changed at a time."""
+
+    def sampler(**changes: Any) -> RenderConfig:
+        return dataclasses.replace(base, sampler=dataclasses.replace(base.sampler, **changes))
+
+    settings: list[tuple[str, Any, RenderConfig]] = [("default", base.sampler.step, base)]
+    many = {"max_samples_per_ray": 1024}  # no ray is coarsened
+    for step in (1.0, 0.5, 0.25, 0.125, 0.0625, 0.03125):
+        settings.append(("step", step, sampler(step=step, **many)))
+    for steps in (2, 4, 8, 16):
+        settings.append(("alpha", 1 / steps, sampler(measure="alpha", step=1 / steps, **many)))
+    for step in (0.05, 0.025, 0.0125):
+        settings.append(("euclidean", step, sampler(measure="euclidean", step=step, **many)))
+    for angle in (0.01, 0.03, 0.1):
+        settings.append(("cone_angle", angle, sampler(cone_angle=angle)))
+    for most in (16, 32, 64):
+        settings.append(("max_samples", most, sampler(max_samples_per_ray=most)))
+    for weight in (0.0, 1e-5, 1e-3, 1e-2):
+        settings.append(("min_weight", weight, dataclasses.replace(base, min_weight=weight)))
+    return settings
+
+
+def reference_frame(impostor: NeuralImpostor, camera: Camera, render: RenderConfig) -> Frame:
+    """The field's integral, converged, in float64."""
+    sampler = dataclasses.replace(
+        render.sampler, measure="barycentric", step=REFERENCE_STEP, cone_angle=0.0,
+        max_samples_per_ray=REFERENCE_SAMPLES, capacity_per_ray=None,
+    )  # fmt: skip
+    exact = dataclasses.replace(render, sampler=sampler, min_weight=0.0)
+    with jax.enable_x64(True):
+        impostor, camera = jax.tree.map(
+            lambda x: x.astype("float64") if x.dtype == "float32" else x, (impostor, camera)
+        )
+        return render_frame(impostor, camera, frame_config(impostor, camera, exact))
+
+
+def mean_psnr(images: Sequence[np.ndarray], others: Sequence[np.ndarray]) -> float:
+    """Mean over views, dB."""
+    return float(np.mean([psnr(a, b) for a, b in zip(images, others, strict=True)]))
+
+
+def mark_front(rows: list[Row]) -> None:
+    """Sets `front`: no other row is at most as slow and at most as wrong, and better in one of the two."""
+    for row in rows:
+        mine = (row["ms"], row["mean_error"])
+        others = [(other["ms"], other["mean_error"]) for other in rows]
+        row["front"] = not any(o[0] <= mine[0] and o[1] <= mine[1] and o != mine for o in others)
+
+
+def write_table(path: Path, rows: list[Row]) -> None:
+    """CSV, one line a setting."""
+    with atomic_path(path) as partial, open(partial, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, rows[0])
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def plot(path: Path, rows: list[Row], title: str) -> None:
+    """Time against mean error, a colour a lever; the front is joined."""
+    figure, axes = plt.subplots(figsize=(9, 6))
+    for lever in dict.fromkeys(row["lever"] for row in rows):
+        points = [row for row in rows if row["lever"] == lever]
+        axes.plot([p["ms"] for p in points], [p["mean_error"] for p in points], "o", label=lever)
+        for point in points:
+            axes.annotate(f"{point['value']:.3g}", (point["ms"], point["mean_error"]), fontsize=7)
+    front = sorted((row["ms"], row["mean_error"]) for row in rows if row["front"])
+    axes.plot(*zip(*front, strict=True), color="0.6", zorder=0)
+    axes.set(xscale="log", yscale="log", xlabel="ms a frame", title=title)
+    axes.set_ylabel("mean error to the converged integral")
+    axes.legend()
+    with atomic_path(path) as partial:
+        figure.savefig(partial, dpi=120, bbox_inches="tight", format="png")
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    run_cli(main)
