@@ -24,7 +24,7 @@ demo: setup  ## train on the built-in scene, print PSNR, write a turntable and a
 	$(BIN)/python experiments/demo.py --workdir=out/demo
 
 test: setup  ## run the tests
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
 test-slow: setup  ## run the tests that take minutes
 	$(BIN)/python -m pytest -m slow
