@@ -85,8 +85,8 @@ def test_quick_face_weights_are_the_careful_ones_unless_they_say_so(rng):
     quick, flat = quick_face_weights(*corners)
     trusted = inside & ~np.asarray(flat)
     assert trusted.sum() > 100
-    # 6e-8 by the least trusted height, 1e-3
-    assert_allclose(np.stack(quick)[:, trusted], careful[:, trusted], atol=1e-3)
+    # 6e-8 by the least trusted height, 1e-2, some ten times over
+    assert_allclose(np.stack(quick)[:, trusted], careful[:, trusted], atol=1e-4)
     assert np.all(flat[::2] | ~inside[::2])
 
 
