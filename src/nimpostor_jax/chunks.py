@@ -22,8 +22,8 @@ def default_chunk(num_items: int) -> int:
 
 
 def padded_size(num_items: int, chunk: int) -> int:
-    """The next multiple of the chunk's size."""
-    return -(-num_items // chunk) * chunk
+    """The next multiple of the chunk's size; at least one chunk, since a loop over none is traced too."""
+    return max(1, -(-num_items // chunk)) * chunk
 
 
 def pad_items(items: Any, chunk: int) -> Any:
@@ -67,6 +67,8 @@ def map_used(
     backward pass computes the function again, chunk by chunk, so that nothing but its arguments is kept.
     """
     num_items = jax.tree.leaves(items)[0].shape[0]
+    if num_items == 0:  # items may index what is shared, which is then as empty
+        return function(shared, items)
     chunk = chunk or default_chunk(num_items)
     result = _map_used(function, chunk, shared, pad_items(items, chunk), num_used)
     return jax.tree.map(lambda x: x[:num_items], result)

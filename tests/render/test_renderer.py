@@ -249,6 +249,14 @@ def test_invisible_samples_may_be_left_out():
     assert_allclose(found.color, expected.color, atol=2e-3)
 
 
+@pytest.mark.parametrize("min_weight", [0.0, 1e-4])
+def test_no_rays_give_no_colours(min_weight):
+    nothing = as_rays((np.zeros((0, 3)), np.zeros((0, 3))))
+    output = render(scenes.impostor(), nothing, dataclasses.replace(RENDER, min_weight=min_weight))
+    assert output.color.shape == (0, 3)
+    assert output.overflow.shape == (0,)
+
+
 def test_overflow_and_coarsening_reach_the_output():
     impostor = scenes.impostor()
     rays = as_rays(rays_at(impostor))

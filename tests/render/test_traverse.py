@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import oracles
 import pytest
-from meshes import MESHES, cube, delaunay, local_vertices, tet_mesh
+from meshes import MESHES, cube, delaunay, grid, local_vertices, tet_mesh
 from numpy.testing import assert_allclose, assert_array_equal
 from rays import DEGENERATE, GENERIC, as_rays, generic, unit
 
@@ -346,3 +346,31 @@ def test_ends_are_differentiable_in_vertices_and_rays(x64, rng):
         expected = oracles.directional_difference(function, x, direction, 1e-6)
         # step^2 times third derivatives, which grow where a ray meets a face at a grazing angle
         assert_allclose(jnp.sum(gradient * direction), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_rays_in_the_planes_of_a_grid_walk_on(dtype, x64, rng, optimized):
+    """Every face of such a plane is seen edge-on; the chord is that of the box, whatever is decided there."""
+    mesh = build_tet_mesh(*grid(np.ones((3, 3, 3), bool)), dtype=dtype)
+    count, half = 4096, np.abs(np.asarray(mesh.vertices)).max()
+    axis = np.arange(count) % 3
+    points, directions = rng.uniform(-half, half, (count, 3)), unit(rng.normal(size=(count, 3)))
+    rows = np.arange(count)
+    points[rows, axis] = rng.choice([-half / 3, half / 3], count)  # the two inner planes across an axis
+    directions[rows, axis] = 0
+    rays = as_rays((points - 3 * unit(directions), unit(directions)), dtype)
+    segments = walk(mesh, rays, MarchConfig(max_tets_per_ray=48, max_entries_per_ray=4))
+    assert not np.any(segments.overflow)
+    used = np.asarray(segments.tet_ids) >= 0
+    ends = np.maximum.accumulate(np.where(used, segments.t_exit, -np.inf), axis=1)
+    tolerance = TOLERANCE[dtype]
+    assert np.all((segments.t_enter[:, 1:] >= ends[:, :-1] - tolerance) | ~used[:, 1:])
+
+    origins, slopes = (np.asarray(x, np.float64) for x in (rays.origins, rays.directions))
+    with np.errstate(divide="ignore"):
+        sides = np.sort((np.array([-half, half])[:, None, None] - origins) / slopes, axis=0)
+    crossed = np.arange(3) != axis[:, None]  # parallel to the third pair of sides, and between them
+    low = np.max(np.where(crossed, sides[0], -np.inf), axis=1)
+    high = np.min(np.where(crossed, sides[1], np.inf), axis=1)
+    chords = np.sum(segments.t_exit - segments.t_enter, axis=1)
+    assert_allclose(chords, np.maximum(high - low, 0), atol=tolerance)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 Lanes = Float[Array, "*lanes"]
 
-EDGE_ON = 1e-2  # height by width of a projected face, below which its area is not trusted
+EDGE_ON = 1e-2  # height by width of a projected face, below which its area loses two digits: not trusted
 
 
 def ray_frame(directions: Sequence[Lanes]) -> tuple[tuple[Lanes, ...], ...]:

@@ -19,7 +19,6 @@ from nimpostor_jax.types import Camera, NeuralImpostor, Rays, RenderOutput
 
 CHUNK = 8192  # rays a call
 REPAIR_CHUNK = 1024  # rays a call with buffers of the largest size
-REPAIRABLE = 0.02  # share of overflowing rays that is cheaper to render again than to avoid
 
 
 class Frame(NamedTuple):

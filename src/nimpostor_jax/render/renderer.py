@@ -70,7 +70,6 @@ def _integrate(
         weights[:, None] * jnp.column_stack([colors, jnp.ones_like(weights), samples.t]),
         samples.rays,
         num_segments=rays.origins.shape[0],
-        indices_are_sorted=True,
     )
     opacity, depth = sums[:, 3], sums[:, 4]
     visible = opacity > 0

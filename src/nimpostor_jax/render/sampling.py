@@ -31,7 +31,6 @@ class Samples:
     slots: Int[Array, " M"]  # position along the ray
     starts: Int[Array, " R"]  # packed index of the ray's first sample
     counts: Int[Array, " R"]  # samples of the ray that fit into the buffer
-    wanted: Int[Array, " R"]  # samples that the ray has
     overflow: Bool[Array, " R"]  # some of the ray's samples did not fit
     coarsened: Bool[Array, " R"]  # the ray needed more than S samples and got larger steps
 
@@ -109,7 +108,6 @@ def sample_segments(
         slots=slots,
         starts=jnp.minimum(firsts, capacity - 1),
         counts=counts,
-        wanted=wanted,
         overflow=counts < wanted,
         coarsened=fits > max_samples,
     )
@@ -156,7 +154,6 @@ def select_samples(samples: Samples, keep: Bool[Array, " M"]) -> Samples:
         slots=jnp.where(used, packed - firsts[rays], 0),
         starts=jnp.minimum(firsts, capacity - 1),
         counts=counts,
-        wanted=samples.wanted,
         overflow=samples.overflow,
         coarsened=samples.coarsened,
     )
