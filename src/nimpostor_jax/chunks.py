@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero, custom_vjp_primal_tree_values
 from jaxtyping import Array, Int
 
 CPU_CHUNK = 8192  # items; accelerators want few large kernels and take all at once
@@ -84,18 +85,21 @@ def _map_used(function: Callable, chunk: int, shared: Any, items: Any, num_used:
 
 
 def _map_used_forward(
-    function: Callable, chunk: int, shared: Any, items: Any, num_used: Array
+    function: Callable, chunk: int, shared: Any, items: Any, num_used: Any
 ) -> tuple[Any, tuple]:
-    return _map_used(function, chunk, shared, items, num_used), (shared, items, num_used)
+    values = custom_vjp_primal_tree_values((shared, items, num_used))
+    return _map_used(function, chunk, *values), (*split_moving((shared, items)), values[2])
 
 
 def _map_used_backward(function: Callable, chunk: int, residuals: tuple, cotangents: Any) -> tuple:
-    shared, items, num_used = residuals
-    (d_shared, fixed), (d_items, fixed_items) = _split(shared), _split(items)
+    (d_shared, d_items), (fixed, fixed_items), num_used = residuals
+    cotangents = materialize(cotangents)
 
     def body(start: Array, sums: tuple) -> tuple:
         part, fixed_part = take((d_items, fixed_items), start, chunk)
-        _, pull = jax.vjp(lambda s, p: function(_join(s, fixed), _join(p, fixed_part)), d_shared, part)
+        _, pull = jax.vjp(
+            lambda s, p: function(join_moving(s, fixed), join_moving(p, fixed_part)), d_shared, part
+        )
         of_shared, of_part = pull(take(cotangents, start, chunk))
         return jax.tree.map(jnp.add, sums[0], of_shared), put(sums[1], start, of_part)
 
@@ -103,15 +107,32 @@ def _map_used_backward(function: Callable, chunk: int, residuals: tuple, cotange
     return *for_chunks(num_used, chunk, body, zeros), None
 
 
-_map_used.defvjp(_map_used_forward, _map_used_backward)
+# Symbolic zeros tell the rules which arguments are differentiated: the others' gradients are spared.
+_map_used.defvjp(_map_used_forward, _map_used_backward, symbolic_zeros=True)
 
 
-def _split(tree: Any) -> tuple[Any, Any]:
-    """The floating-point leaves, and the others; each with None in the place of the other's."""
-    floats = jax.tree.map(lambda x: x if jnp.issubdtype(x.dtype, jnp.inexact) else None, tree)
-    others = jax.tree.map(lambda x: None if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree)
-    return floats, others
+def materialize(cotangents: Any) -> Any:
+    """Cotangents of a custom VJP with arrays in the place of symbolic zeros."""
+    return jax.tree.map(
+        lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x,
+        cotangents,
+        is_leaf=lambda x: isinstance(x, SymbolicZero),
+    )
 
 
-def _join(floats: Any, others: Any) -> Any:
-    return jax.tree.map(lambda x, y: y if x is None else x, floats, others, is_leaf=lambda x: x is None)
+def split_moving(arguments: Any) -> tuple[Any, Any]:
+    """A custom VJP's arguments: leaves that are differentiated, and others; None in each other's place."""
+    moving, fixed = (
+        jax.tree.map(
+            lambda x, keep=keep: x.value if x.perturbed == keep else None,
+            arguments,
+            is_leaf=lambda x: isinstance(x, CustomVJPPrimal),
+        )
+        for keep in (True, False)
+    )
+    return moving, fixed
+
+
+def join_moving(moving: Any, fixed: Any) -> Any:
+    """What `split_moving` split."""
+    return jax.tree.map(lambda x, y: y if x is None else x, moving, fixed, is_leaf=lambda x: x is None)

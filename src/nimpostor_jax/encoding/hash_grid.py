@@ -18,9 +18,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.custom_derivatives import custom_vjp_primal_tree_values
 from jaxtyping import Array, Float, Int, UInt
 
-from nimpostor_jax.chunks import default_chunk, for_chunks, pad_items, put, take
+from nimpostor_jax.chunks import (
+    default_chunk,
+    for_chunks,
+    join_moving,
+    materialize,
+    pad_items,
+    put,
+    split_moving,
+    take,
+)
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.layout import SIZE_BITS
 from nimpostor_jax.types import HashLayout, HashTables
@@ -88,13 +98,17 @@ def _encode(
 
 
 def _encode_forward(config: EncodingConfig, chunk: int, *arguments: Any) -> tuple[Array, tuple]:
-    return _encode(config, chunk, *arguments), arguments
+    values = custom_vjp_primal_tree_values(arguments)
+    moving, fixed = split_moving((arguments[0], arguments[3]))  # tables and coordinates
+    return _encode(config, chunk, *values), (moving, fixed, values[1], values[2], values[4])
 
 
 def _encode_backward(
     config: EncodingConfig, chunk: int, residuals: tuple, cotangent: Float[Array, "M L*F"]
 ) -> tuple:
-    features, layout, tet_ids, lambdas, num_used = residuals
+    moving, fixed, layout, tet_ids, num_used = residuals
+    features, lambdas = join_moving(moving, fixed)
+    cotangent = materialize(cotangent)
 
     def encode_chunk(start: Array, sums: tuple) -> tuple:
         d_features, d_lambdas = sums
@@ -110,21 +124,28 @@ def _encode_backward(
             d_weights = []
             for weight, node in zip(weights, nodes, strict=True):
                 entries = address(node)
-                d_weights.append(jnp.sum(_rows(features, entries) * d_level, axis=-1).astype(weight.dtype))
-                d_rows = weight[:, None] * d_level
-                d_features = d_features.at[entries].add(d_rows, mode="promise_in_bounds")
-            return d_features, jax.tree.map(jnp.add, d_coordinates, *pull(d_weights))
+                if d_coordinates is not None:
+                    products = _rows(features, entries) * d_level
+                    d_weights.append(jnp.sum(products, axis=-1).astype(weight.dtype))
+                if d_features is not None:
+                    d_rows = weight[:, None] * d_level
+                    d_features = d_features.at[entries].add(d_rows, mode="promise_in_bounds")
+            if d_coordinates is not None:
+                d_coordinates = jax.tree.map(jnp.add, d_coordinates, *pull(d_weights))
+            return d_features, d_coordinates
 
-        zeros = jax.tree.map(jnp.zeros_like, coordinates)
+        zeros = None if d_lambdas is None else jax.tree.map(jnp.zeros_like, coordinates)
         d_features, d_coordinates = _for_levels(config, layout, points, add_level, (d_features, zeros))
-        return d_features, put(d_lambdas, start, *pull_coordinates(d_coordinates))
+        if d_lambdas is not None:
+            d_lambdas = put(d_lambdas, start, *pull_coordinates(d_coordinates))
+        return d_features, d_lambdas
 
-    zeros = jax.tree.map(jnp.zeros_like, (features, lambdas))
+    zeros = jax.tree.map(jnp.zeros_like, moving)
     d_features, d_lambdas = for_chunks(num_used, chunk, encode_chunk, zeros)
     return d_features, None, None, d_lambdas, None
 
 
-_encode.defvjp(_encode_forward, _encode_backward)
+_encode.defvjp(_encode_forward, _encode_backward, symbolic_zeros=True)
 
 
 @struct.dataclass

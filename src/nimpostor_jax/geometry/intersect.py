@@ -19,12 +19,16 @@ EDGE_ON = 1e-2  # height by width of a projected face, below which its area lose
 
 
 def ray_frame(directions: Sequence[Lanes]) -> tuple[tuple[Lanes, ...], ...]:
-    """Orthonormal axes for a unit direction (Duff et al. 2017): two across the ray, then its own."""
+    """Orthonormal axes for a unit direction (Duff et al. 2017): two across the ray, then its own.
+
+    The same bits wherever it is compiled, as `project`.
+    """
     x, y, z = directions
     sign = jnp.where(z >= 0, 1.0, -1.0).astype(x.dtype)
     a = -1 / (sign + z)
     b = x * y * a
-    return (1 + sign * x * x * a, sign * b, -sign * x), (b, sign + y * y * a, -y), (x, y, z)
+    across = (1 + _rounded(sign * x * x * a), sign * b, -sign * x)
+    return across, (b, sign + _rounded(y * y * a), -y), (x, y, z)
 
 
 def project(

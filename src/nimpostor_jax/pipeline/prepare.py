@@ -94,7 +94,10 @@ def prepare(
     finest = config.impostor.encoding.resolutions[-1]
     log(f"the finest grid cell is {pixels_per_cell(vertices, tets, train, finest):.2f} pixels wide")
     probe = draw_batch(key, 0, pool, min(config.train.rays_per_batch, 8192), "white")
-    render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, config.render)
+    entries = pool.entries.holds.shape[1]
+    march = dataclasses.replace(config.render.march, max_entries_per_ray=entries)
+    render = dataclasses.replace(config.render, march=march)
+    render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, render)
     return Scene(config=config, train=train, test=test, impostor=impostor, pool=pool, render=render)
 
 

@@ -17,17 +17,32 @@ from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.sampling import segment_measure, step_boundaries
 from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.traverse import MarchTables, traverse
+from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
 from nimpostor_jax.types import Rays, TetMesh
 
 MAX_GROWTH = 6  # doublings of a buffer before giving up
 
 
 @partial(jax.jit, static_argnames="config")
-def rays_hit(mesh: TetMesh, tables: MarchTables, rays: Rays, config: MarchConfig) -> Bool[Array, " R"]:
-    """Which world-space rays' lines meet the cage at all."""
-    first_only = dataclasses.replace(config, max_tets_per_ray=1, max_entries_per_ray=1)
-    return traverse(tables, to_local(mesh, rays), first_only).codes[:, 0] >= 0
+def ray_entries(mesh: TetMesh, tables: MarchTables, rays: Rays, config: MarchConfig) -> Entries:
+    """Where world-space rays enter the cage; those that do not have -1 in their first slot."""
+    return find_entries(tables, to_local(mesh, rays), config)
+
+
+def all_entries(
+    mesh: TetMesh, tables: MarchTables, rays: Rays, config: MarchConfig
+) -> tuple[Entries, MarchConfig]:
+    """`ray_entries` in as many slots as any of these rays needs, and the config with that number."""
+    slots = config.max_entries_per_ray
+    for _ in range(MAX_GROWTH + 1):
+        config = dataclasses.replace(config, max_entries_per_ray=slots)
+        entries = ray_entries(mesh, tables, rays, config)
+        if not np.any(entries.overflow):
+            break
+        slots *= 2
+    most = max(1, int(np.sum(np.asarray(entries.holds) >= 0, axis=1).max(initial=0)))
+    entries = dataclasses.replace(entries, holds=entries.holds[:, :most])
+    return entries, dataclasses.replace(config, max_entries_per_ray=most)
 
 
 @partial(jax.jit, static_argnames="config")

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float
 
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
-from nimpostor_jax.render.capacity import MAX_GROWTH, fit_capacities, grow_march, rays_hit
+from nimpostor_jax.render.capacity import MAX_GROWTH, all_entries, fit_capacities, grow_march, ray_entries
 from nimpostor_jax.render.renderer import render_rays
-from nimpostor_jax.render.traverse import MarchTables, march_tables
+from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays, RenderOutput
 
 CHUNK = 8192  # rays a call
@@ -50,9 +50,11 @@ def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     """
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, camera.height, camera.width)
-    hits = np.flatnonzero(rays_hit(impostor.mesh, tables, rays, config.march))
+    entries, march = all_entries(impostor.mesh, tables, rays, config.march)
+    hits = np.flatnonzero(np.asarray(entries.holds)[:, 0] >= 0)
     if not hits.size:
         return config
+    config = dataclasses.replace(config, march=march)
     chosen = hits[np.linspace(0, hits.size - 1, CHUNK).round().astype(int)]
     probe = jax.tree.map(lambda x: x[chosen], rays)
     return fit_capacities(impostor.mesh, tables, probe, config)
@@ -69,7 +71,8 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     height, width = camera.height, camera.width
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, height, width)
-    pending = np.flatnonzero(rays_hit(impostor.mesh, tables, rays, config.march))
+    entries = ray_entries(impostor.mesh, tables, rays, config.march)
+    pending = np.flatnonzero(np.asarray(entries.holds)[:, 0] >= 0)
     order = tile_order(height, width)
     dtype, pixels = impostor.mesh.vertices.dtype, height * width
     frame = Frame(
@@ -84,7 +87,8 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
         chunks, outputs = _spread(pending, chunk), []
         for chosen in chunks:
             padded = np.concatenate([chosen, np.full(chunk - len(chosen), chosen[-1])])
-            outputs.append(render(jax.tree.map(lambda x, p=padded: x[p], rays), config))
+            part = jax.tree.map(lambda x, p=padded: x[p], (rays, entries))
+            outputs.append(render(part[0], part[1], config))
         overflowed = []
         for chosen, output in zip(chunks, outputs, strict=True):
             for name, target in frame._asdict().items():
@@ -94,6 +98,7 @@ def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
         if not pending.size:
             return Frame(*(x.reshape(height, width, *x.shape[1:]) for x in frame))
         config, chunk = _grow(config), REPAIR_CHUNK * render.num_devices
+        entries = None  # the larger config has more slots for them
     raise RuntimeError(
         f"{pending.size} rays need more than {config.march.max_tets_per_ray} tets or "
         f"{config.march.max_entries_per_ray} entries; raise MarchConfig's sizes"
@@ -109,9 +114,9 @@ class _Renderer:
         self._replicas = jax.device_put((impostor, tables), NamedSharding(mesh, P()))
         self._rays = NamedSharding(mesh, P("rays"))
 
-    def __call__(self, rays: Rays, config: RenderConfig) -> RenderOutput:
+    def __call__(self, rays: Rays, entries: Entries | None, config: RenderConfig) -> RenderOutput:
         """Start rendering; the number of rays is a multiple of the number of devices."""
-        return _render_sharded(*self._replicas, jax.device_put(rays, self._rays), config)
+        return _render_sharded(*self._replicas, *jax.device_put((rays, entries), self._rays), config)
 
 
 @cache
@@ -122,19 +127,25 @@ def _device_mesh() -> Mesh:
 
 @partial(jax.jit, static_argnames="config")
 def _render_sharded(
-    impostor: NeuralImpostor, tables: MarchTables, rays: Rays, config: RenderConfig
+    impostor: NeuralImpostor,
+    tables: MarchTables,
+    rays: Rays,
+    entries: Entries | None,
+    config: RenderConfig,
 ) -> RenderOutput:
     @partial(
         jax.shard_map,
         mesh=_device_mesh(),
-        in_specs=(P(), P(), P("rays")),
+        in_specs=(P(), P(), P("rays"), P("rays")),
         out_specs=P("rays"),
         check_vma=False,
     )
-    def shard(impostor: NeuralImpostor, tables: MarchTables, rays: Rays) -> RenderOutput:
-        return render_rays(impostor, rays, config, tables=tables)
+    def shard(
+        impostor: NeuralImpostor, tables: MarchTables, rays: Rays, entries: Entries | None
+    ) -> RenderOutput:
+        return render_rays(impostor, rays, config, tables=tables, entries=entries)
 
-    return shard(impostor, tables, rays)
+    return shard(impostor, tables, rays, entries)
 
 
 def _spread(rays: np.ndarray, chunk: int) -> list[np.ndarray]:

@@ -19,7 +19,7 @@ from nimpostor_jax.render.sampling import (
     to_grid,
 )
 from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.traverse import MarchTables, march_tables, traverse
+from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, RenderOutput
 
 
@@ -29,18 +29,20 @@ def render_rays(
     config: RenderConfig,
     jitter: Float[Array, " R"] | None = None,
     tables: MarchTables | None = None,
+    entries: Entries | None = None,
 ) -> RenderOutput:
     """Colour, opacity and depth of rays [R] given in world space. Pure; jit it with `config` static.
 
     Differentiable in every array of the impostor (tables, decoders, vertices) and in the rays. With `jitter`
     in [0, 1) samples move within their steps (training); without, they sit in the middle. Pass `tables` to
-    spare rearranging the mesh in every call; by default they are made from the mesh's current vertices.
+    spare rearranging the mesh in every call; by default they are made from the mesh's current vertices. Pass
+    the rays' `entries` (`traverse.find_entries`) where the same rays see the same mesh again.
     """
     local = to_local(impostor.mesh, rays)
     near = config.near / impostor.mesh.scale
     if tables is None:
         tables = march_tables(impostor.mesh)
-    crossings = traverse(tables, local, config.march)
+    crossings = traverse(tables, local, config.march, entries)
     segments = locate_segments(impostor.mesh, local, crossings, near)
     samples = sample_segments(segments, config.sampler, config.density_measure, jitter)
     return _integrate(impostor, local, samples, segments.overflow, config)

@@ -66,6 +66,18 @@ class MarchTables:
 
 
 @struct.dataclass
+class Entries:
+    """Where each ray's line enters the cage from outside, in order along the line; a fact of mesh and ray.
+
+    Finding them costs more than marching: find them once for rays that are cast again.
+    """
+
+    holds: Int[Array, "R B"]  # 3 * (4 tet + f) of the boundary face; -1 pads
+    overflow: Bool[Array, " R"]  # more entries than slots
+    unsure: Bool[Array, " R"]  # tests were too close for the quick way: march with care
+
+
+@struct.dataclass
 class Crossings:
     """The tets that each ray's line crosses, as codes, in order along the line.
 
@@ -114,33 +126,60 @@ def _next_holds(tets: Int[Array, "T 4"], neighbors: Int[Array, "T 4"]) -> Int[Ar
     return jnp.stack(columns, axis=1).reshape(-1).astype(jnp.int32)
 
 
-def traverse(tables: MarchTables, rays: Rays, config: MarchConfig) -> Crossings:
+def find_entries(tables: MarchTables, rays: Rays, config: MarchConfig) -> Entries:
+    """The front-facing boundary faces on the line of each ray; rays [R] in the mesh's own frame."""
+    tiles = _Tiles(rays.origins.shape[0], config)
+    lines = tuple(map(tiles.split, (rays.origins, rays.directions)))
+    holds, count, unsure = jax.lax.map(lambda line: _find_entries(tables, config, False, *line), lines)
+    return Entries(
+        holds=tiles.join(holds),
+        overflow=tiles.join(count) > config.max_entries_per_ray,
+        unsure=tiles.join(unsure),
+    )
+
+
+def traverse(
+    tables: MarchTables, rays: Rays, config: MarchConfig, entries: Entries | None = None
+) -> Crossings:
     """The tets that the line of each ray crosses, in order; rays [R] in the mesh's own frame.
 
     Memory is rays x slots, never rays x tets. `overflow` marks rays with more tets or entries than the
     config has slots for; their crossings are complete up to there. Tets behind a ray's origin use slots too.
+    Pass the rays' `entries`, if they are known, to spare their search.
     """
-    num_rays = rays.origins.shape[0]
-    default = CPU_TILE if jax.default_backend() == "cpu" else num_rays
-    tile = max(1, min(config.tile_size or default, num_rays))
-    num_tiles = -(-num_rays // tile)
-    padding = ((0, num_tiles * tile - num_rays), (0, 0))
-
-    def tiles(x: Float[Array, "R 3"]) -> Float[Array, "tiles 3 lanes"]:
-        padded = jnp.pad(jax.lax.stop_gradient(x), padding, mode="edge") if num_rays else x
-        return padded.reshape(num_tiles, tile, 3).transpose(0, 2, 1)
-
+    if entries is None:
+        entries = find_entries(tables, rays, config)
+    tiles = _Tiles(rays.origins.shape[0], config)
+    parts = (rays.origins, rays.directions, entries.holds)
     codes, ends, overflow, unsure = jax.lax.map(
-        lambda rays: _march_tile(tables, config, False, *rays),
-        (tiles(rays.origins), tiles(rays.directions)),
+        lambda parts: _march_tile(tables, config, False, *parts), tuple(map(tiles.split, parts))
     )
-    slots = config.max_tets_per_ray
-    codes = codes.transpose(0, 2, 1).reshape(num_tiles * tile, slots)
-    ends = ends.transpose(2, 0, 3, 1).reshape(6, num_tiles * tile, slots)
     crossings = Crossings(
-        codes=codes[:num_rays], ends=ends[:, :num_rays], overflow=overflow.reshape(-1)[:num_rays]
+        codes=tiles.join(codes),
+        ends=tiles.join(ends.transpose(0, 2, 1, 3), axis=1),
+        overflow=tiles.join(overflow) | entries.overflow,
     )
-    return _march_again(tables, rays, config, crossings, unsure.reshape(-1)[:num_rays], tile)
+    return _march_again(tables, rays, config, crossings, tiles.join(unsure) | entries.unsure, tiles.size)
+
+
+class _Tiles:
+    """Rays in tiles that are marched together: [R, rest] as [tiles, rest, lanes], and back."""
+
+    def __init__(self, num_rays: int, config: MarchConfig):
+        default = CPU_TILE if jax.default_backend() == "cpu" else num_rays
+        self.num_rays, self.size = num_rays, max(1, min(config.tile_size or default, num_rays))
+
+    def split(self, x: Array) -> Array:
+        """Of rays to tiles; the last ray fills up the last tile."""
+        padding = ((0, -self.num_rays % self.size), (0, 0))
+        padded = jnp.pad(jax.lax.stop_gradient(x), padding, mode="edge") if self.num_rays else x
+        return padded.reshape(-1, self.size, x.shape[1]).transpose(0, 2, 1)
+
+    def join(self, x: Array, axis: int = 0) -> Array:
+        """[tiles, (first,) (rest,) lanes] to [(first,) R, (rest)]; `axis` is where R goes."""
+        lanes_second = jnp.moveaxis(x, -1, 1)
+        joined = lanes_second.reshape(-1, *lanes_second.shape[2:])[: self.num_rays]
+        return jnp.moveaxis(joined, 0, axis)
 
 
 def _march_again(
@@ -159,7 +198,9 @@ def _march_again(
     def march(start: Array, found: Crossings) -> Crossings:
         chosen = take(again, start, tile)  # past the end: read the last ray, write nothing
         origins, directions = (x.at[chosen].get(mode="clip").T for x in lines)
-        codes, ends, overflow, _ = _march_tile(tables, config, True, origins, directions)
+        holds, count, _ = _find_entries(tables, config, True, origins, directions)
+        codes, ends, overflow, _ = _march_tile(tables, config, True, origins, directions, holds)
+        overflow |= count > config.max_entries_per_ray
         return Crossings(
             codes=found.codes.at[chosen].set(codes.T, mode="drop"),
             ends=found.ends.at[:, chosen].set(ends.transpose(1, 2, 0), mode="drop"),
@@ -175,12 +216,10 @@ def _march_tile(
     careful: bool,
     origins: Float[Array, "3 lanes"],
     directions: Float[Array, "3 lanes"],
+    entry_holds: Int[Array, "B lanes"],
 ) -> tuple[Int[Array, "K lanes"], Float[Array, "K 6 lanes"], Bool[Array, " lanes"], Bool[Array, " lanes"]]:
     """Codes and ends, overflow, and the lanes on which tests were too close for the quick way."""
-    # One rounding of the axes for all kernels below, for the reason that `project` gives.
-    origin, axes = tuple(origins), jax.lax.optimization_barrier(ray_frame(tuple(directions)))
-    entry_holds, num_entries, unsure = _find_entries(tables, config, careful, origin, axes)
-
+    origin, axes = _frame(origins, directions)
     lanes, slots = origins.shape[1], config.max_tets_per_ray
 
     def held_triangle(
@@ -236,10 +275,15 @@ def _march_tile(
         jnp.ones(lanes, jnp.int32),  # the next entry to take
         jnp.full((slots, lanes), -1, jnp.int32),
         jnp.zeros((slots, 6, lanes), origins.dtype),
-        unsure,
+        jnp.zeros(lanes, bool),
     )
     _, hold, _, _, _, codes, ends, unsure = jax.lax.while_loop(unfinished, step, start)
-    return codes, ends, (hold >= 0) | (num_entries > config.max_entries_per_ray), unsure
+    return codes, ends, hold >= 0, unsure
+
+
+def _frame(origins: Float[Array, "3 lanes"], directions: Float[Array, "3 lanes"]) -> tuple[tuple, tuple]:
+    """Origin and axes to `project` on, computed once for all kernels that follow."""
+    return tuple(origins), jax.lax.optimization_barrier(ray_frame(tuple(directions)))
 
 
 def _sides(edges: Iterable[tuple], careful: bool) -> tuple[list[Array], list[Array]]:
@@ -263,11 +307,15 @@ def _met(
 
 
 def _find_entries(
-    tables: MarchTables, config: MarchConfig, careful: bool, origin: tuple, axes: tuple
+    tables: MarchTables,
+    config: MarchConfig,
+    careful: bool,
+    origins: Float[Array, "3 lanes"],
+    directions: Float[Array, "3 lanes"],
 ) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"], Bool[Array, " lanes"]]:
     """The front-facing boundary faces on each lane's line by t: their holds (-1 pads), count, and doubt."""
-    lanes, slots = origin[0].shape[0], config.max_entries_per_ray
-    dtype = origin[0].dtype
+    origin, axes = _frame(origins, directions)
+    lanes, slots, dtype = origins.shape[1], config.max_entries_per_ray, origins.dtype
     clusters, width = tables.face_holds.shape
     words = _pack_bits(_near_clusters(tables, origin, axes[2]))
 

@@ -1,5 +1,6 @@
 """The pixels to train on: those of all views whose rays hit the cage, as one pool to draw batches from."""
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -10,8 +11,8 @@ from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.config import Background, MarchConfig
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
-from nimpostor_jax.render.capacity import rays_hit
-from nimpostor_jax.render.traverse import march_tables
+from nimpostor_jax.render.capacity import all_entries
+from nimpostor_jax.render.traverse import Entries, march_tables
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import Camera, TetMesh
 
@@ -23,6 +24,7 @@ class PixelPool:
     views: Int[Array, " P"]
     pixels: Int[Array, "P 2"]  # x, y
     colors: Float[Array, "P 4"]  # premultiplied
+    entries: Entries  # into the cage: pixels and cage stay, so that they are sought once
     cameras: Camera  # batched over N
 
 
@@ -37,15 +39,20 @@ def build_pool(
     order = tile_order(cameras.height, cameras.width)
     grid = image_pixels(cameras.height, cameras.width).reshape(-1, 2)[order]
     cast = jax.jit(lambda camera: pixel_rays(camera, grid))
-    views, indices, missed, foreground = [], [], 0, 0
+    views, indices, entries, missed, foreground = [], [], [], 0, 0
     for view in range(len(images)):
         rays = cast(_one(cameras, view))
+        found, grown = all_entries(mesh, tables, rays, march)
+        march = max(march, grown, key=lambda config: config.max_entries_per_ray)
         hits = np.zeros(len(order), bool)
-        hits[order] = rays_hit(mesh, tables, rays, march)
+        hits[order] = np.asarray(found.holds)[:, 0] >= 0
         solid = images[view, ..., 3].reshape(-1) > 0.5
         missed += int(np.sum(solid & ~hits))
         foreground += int(np.sum(solid))
         indices.append(np.flatnonzero(hits))
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        entries.append(jax.tree.map(lambda x, kept=rank[indices[-1]]: x[kept], found))
         views.append(np.full(len(indices[-1]), view))
     if not sum(map(len, indices)):
         raise ValueError(
@@ -59,9 +66,20 @@ def build_pool(
             np.stack([pixel_ids % cameras.width, pixel_ids // cameras.width], axis=1), jnp.int32
         ),
         colors=jnp.asarray(flat[view_ids, pixel_ids]),
+        entries=_concatenated(entries),
         cameras=cameras,
     )
     return pool, missed / max(foreground, 1)
+
+
+def _concatenated(parts: list[Entries]) -> Entries:
+    slots = max(part.holds.shape[1] for part in parts)
+
+    def padded(part: Entries) -> Entries:
+        padding = ((0, 0), (0, slots - part.holds.shape[1]))
+        return dataclasses.replace(part, holds=jnp.pad(part.holds, padding, constant_values=-1))
+
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *map(padded, parts))
 
 
 def _one(cameras: Camera, view: int) -> Camera:
@@ -86,4 +104,5 @@ def draw_batch(
         target=pool.colors[chosen],
         background=colors,
         jitter=jax.random.uniform(jitter_key, (size,)),
+        entries=jax.tree.map(lambda x: x[chosen], pool.entries),
     )

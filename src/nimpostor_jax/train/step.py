@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from nimpostor_jax.config import RenderConfig, TrainConfig
 from nimpostor_jax.render.composite import blend_background
 from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.traverse import Entries
 from nimpostor_jax.train.losses import photometric
 from nimpostor_jax.types import NeuralImpostor, Rays
 
@@ -28,6 +29,7 @@ class RayBatch:
     target: Float[Array, "R 4"]  # premultiplied colour and opacity
     background: Float[Array, "R 3"]
     jitter: Float[Array, " R"]
+    entries: Entries | None = None  # into the cage, where it stays as it is
 
 
 @struct.dataclass
@@ -74,7 +76,8 @@ def render_loss(
     parameters: Parameters, impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig
 ) -> tuple[Float[Array, ""], Metrics]:
     """Photometric loss of a batch over its backgrounds, and what the driver watches."""
-    output = render_rays(with_parameters(impostor, parameters), batch.rays, config, batch.jitter)
+    impostor = with_parameters(impostor, parameters)
+    output = render_rays(impostor, batch.rays, config, batch.jitter, entries=batch.entries)
     color = blend_background(output.color, output.opacity, batch.background)
     target = blend_background(batch.target[:, :3], batch.target[:, 3], batch.background)
     loss = photometric(color, target, output.overflow)
