@@ -162,7 +162,7 @@ def count_samples(scene: Scene, size: int) -> int:
     def counts() -> jax.Array:
         rays = to_local(mesh, batch.rays)
         segments = locate_segments(mesh, rays, traverse(march_tables(mesh), rays, scene.render.march))
-        return jnp.sum(sample_segments(segments, scene.render.sampler, "barycentric").counts)
+        return sample_segments(segments, scene.render.sampler, "barycentric").num_used
 
     return int(counts())
 

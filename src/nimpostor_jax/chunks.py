@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.custom_derivatives import CustomVJPPrimal, SymbolicZero, custom_vjp_primal_tree_values
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Int
 
 CPU_CHUNK = 8192  # items; accelerators want few large kernels and take all at once
 
@@ -52,6 +52,23 @@ def take(items: Any, start: Int[Array, ""], chunk: int) -> Any:
 def put(items: Any, start: Int[Array, ""], values: Any) -> Any:
     """Arrays [M, ...] with the chunk at `start` replaced."""
     return jax.tree.map(lambda x, v: jax.lax.dynamic_update_slice_in_dim(x, v, start, 0), items, values)
+
+
+def packed_indices(keep: Bool[Array, " M"]) -> tuple[Int[Array, " M"], Int[Array, ""]]:
+    """Where the flags are set, in order at the front (0 fills the rest), and how often.
+
+    `jnp.nonzero` does the same in three times the time on a CPU.
+    """
+    count = keep.shape[0]
+    rows = jnp.pad(keep, (0, -count % _ROW)).reshape(-1, _ROW).T.astype(jnp.int32)
+    in_rows, places = jax.lax.scan(lambda total, row: (total + row, total), jnp.zeros_like(rows[0]), rows)
+    places = (places + jnp.cumsum(in_rows) - in_rows).T.reshape(-1)[:count]
+    order = jnp.arange(count, dtype=jnp.int32)
+    indices = jnp.zeros(count, jnp.int32).at[jnp.where(keep, places, count)].set(order, mode="drop")
+    return indices, jnp.sum(in_rows)
+
+
+_ROW = 64  # flags counted one after another, in all rows at once
 
 
 def map_used(

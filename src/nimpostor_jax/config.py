@@ -176,7 +176,8 @@ class RenderConfig:
     sampler: SamplerConfig = SamplerConfig()
     density_measure: Literal["barycentric", "euclidean"] = "barycentric"  # Eq. 9 or Eq. 8
     near: float = 0.0  # in world units
-    min_weight: float = 1e-4  # samples that contribute less get no colour and no gradient; 0: all do
+    min_weight: float = 1e-3  # samples that contribute less get no colour and no gradient; 0: all do
+    skip_empty: bool = True  # leave out samples in cells that training found empty or hidden
 
     def __post_init__(self) -> None:
         _require(0 <= self.min_weight < 1, self, "min_weight", "in [0, 1)")
@@ -239,6 +240,8 @@ class TrainConfig:
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50
     background: Background = "random"
+    cells_per_edge: int = 16  # of the occupancy grid in each tet; 0: no sample is left out
+    forget_after: int = 500  # steps after which a cell that no ray sees counts as empty
     seed: int = 0
     log_every: int = 50
     eval_every: int = 0  # 0: only at the end
@@ -256,6 +259,8 @@ class TrainConfig:
             "background",
             f"one of {typing.get_args(Background)}",
         )
+        _require(0 <= self.cells_per_edge <= 64, self, "cells_per_edge", "in [0, 64]")
+        _require(self.forget_after >= 1, self, "forget_after", ">= 1")
         _require(self.log_every >= 1, self, "log_every", ">= 1")
         _require(self.eval_every >= 0, self, "eval_every", ">= 0")
         _require(self.checkpoint_every >= 1, self, "checkpoint_every", ">= 1")

@@ -110,6 +110,7 @@ class NeuralImpostor:
     decoders: dict[str, Any]  # every leaf has a leading axis: the stack of decoder sets
     decoder_index: Int[Array, " T"]  # which decoder set a tet uses
     config: ImpostorConfig = struct.field(pytree_node=False)
+    occupied: Bool[Array, "T cells"] | None = None  # cells of `render.occupancy` that may be seen; None: all
 
 
 @struct.dataclass

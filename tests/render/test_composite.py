@@ -9,9 +9,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from nimpostor_jax.render.composite import blend_background, sample_weights, transmittance
+from nimpostor_jax.render.composite import ROW, blend_background, sample_weights, sum_before, transmittance
 
-weights_of = jax.jit(lambda sigmas, deltas: sample_weights(sigmas * deltas))
+
+@jax.jit
+def weights_of(sigmas, deltas):
+    """Of one ray."""
+    return sample_weights(sigmas * deltas, jnp.zeros(len(sigmas), jnp.int32))
+
+
+def packed_rays(counts):
+    """The ray of each sample."""
+    return np.repeat(np.arange(len(counts), dtype=np.int32), counts)
 
 
 @settings(max_examples=50, deadline=None)
@@ -28,16 +37,44 @@ def test_weights_follow_the_loop(sigmas, deltas):
     assert weights.sum() <= 1 + 1e-6
 
 
-def test_leading_axes_are_a_batch(rng):
-    sigmas, deltas = rng.uniform(0, 3, (2, 3, 4, 5)).astype(np.float32)
-    weights = weights_of(sigmas, deltas)
-    for index in np.ndindex(3, 4):
-        assert_allclose(weights[index], oracles.composite(sigmas[index], deltas[index]), atol=1e-6)
+def test_packed_rays_do_not_see_each_other(rng):
+    counts = [3, 0, 1, 7]
+    rays = packed_rays(counts)
+    sigmas, deltas = rng.uniform(0, 3, (2, len(rays))).astype(np.float32)
+    weights = sample_weights(jnp.asarray(sigmas * deltas), jnp.asarray(rays))
+    for ray in range(len(counts)):
+        mine = rays == ray
+        assert_allclose(weights[mine], oracles.composite(sigmas[mine], deltas[mine]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "counts",
+    [[], [1], [ROW], [ROW + 1], [5 * ROW + 3], [3, 4 * ROW, 2, 0, ROW], [1] * (3 * ROW), [50] * 9],
+)
+def test_sums_before_follow_the_loop_across_rows(counts, rng):
+    """Forward and, as the transpose, backward."""
+    rays = packed_rays(counts)
+    values, mix = rng.uniform(0, 1, (2, len(rays))).astype(np.float32)
+    sums = jax.jit(sum_before)(values, rays)
+    gradient = jax.jit(jax.grad(lambda v: jnp.sum(mix * sum_before(v, rays))))(values)
+    for ray in range(len(counts)):
+        mine = rays == ray
+        before = np.cumsum(values[mine], dtype=np.float64) - values[mine]
+        after = np.cumsum(mix[mine][::-1], dtype=np.float64)[::-1] - mix[mine]
+        assert_allclose(sums[mine], before, rtol=1e-5, atol=1e-6)  # up to 300 float32 additions
+        assert_allclose(gradient[mine], after, rtol=1e-5, atol=1e-6)
+
+
+def test_a_thin_ray_behind_a_dense_one_keeps_its_digits():
+    """Differences of a sum over all rays would be lost beside 1e8."""
+    values = jnp.asarray(np.r_[np.full(100, 1e8), 1e-3, 2e-3, 3e-3], jnp.float32)
+    sums = sum_before(values, jnp.asarray(packed_rays([100, 3])))
+    assert_allclose(sums[100:], [0, 1e-3, 3e-3], rtol=1e-6)
 
 
 def test_transmittance_excludes_the_samples_own_interval():
     depth = jnp.array([1.0, 2.0, 3.0])
-    assert_allclose(transmittance(depth), np.exp([0, -1, -3]), rtol=1e-6)
+    assert_allclose(transmittance(depth, jnp.zeros(3, jnp.int32)), np.exp([0, -1, -3]), rtol=1e-6)
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1e-30, 1e8, float(np.exp(40))])
@@ -55,7 +92,7 @@ def test_extreme_densities_stay_finite(sigma):
 def test_a_constant_slab_has_the_analytic_opacity(sigma, rng):
     """1 - exp(-sigma * total), however the slab is cut."""
     deltas = rng.dirichlet(np.ones(20)).astype(np.float32) * 1.7
-    opacity = jnp.sum(sample_weights(sigma * deltas))
+    opacity = jnp.sum(weights_of(np.full(20, sigma, np.float32), deltas))
     assert_allclose(opacity, -np.expm1(-sigma * 1.7), rtol=3e-6)  # a sum of 20 float32 terms
 
 
@@ -63,7 +100,7 @@ def test_gradients_match_finite_differences(x64, rng):
     x, mix = rng.uniform(0.1, 2, (2, 6)), rng.normal(size=6)
 
     def function(x):
-        return jnp.sum(mix * sample_weights(x[0] * x[1]))
+        return jnp.sum(mix * sample_weights(jnp.ravel(x[0] * x[1]), jnp.array([0, 0, 0, 1, 1, 1])))
 
     gradient = jax.grad(function)(jnp.asarray(x))
     direction = rng.normal(size=x.shape)

@@ -15,12 +15,10 @@ from rays import as_rays, generic, missing
 
 from nimpostor_jax.config import MarchConfig, SamplerConfig
 from nimpostor_jax.render.sampling import (
-    from_grid,
     sample_segments,
     segment_measure,
     select_samples,
     step_boundaries,
-    to_grid,
 )
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
@@ -72,9 +70,14 @@ def segments_of(*rays, slots=4):
 
 def used(samples):
     """The used slots, as a tree of NumPy arrays [N, ...]."""
-    count = int(np.sum(samples.counts))
-    names = ("tet_ids", "lambdas", "t", "deltas", "rays", "slots")
+    count = int(samples.num_used)
+    names = ("tet_ids", "lambdas", "t", "deltas", "rays")
     return {name: np.asarray(getattr(samples, name))[:count] for name in names}
+
+
+def per_ray(samples):
+    """How many samples each ray has."""
+    return np.bincount(used(samples)["rays"], minlength=len(samples.overflow))
 
 
 @pytest.mark.parametrize("jittered", [False, True])
@@ -95,7 +98,6 @@ def test_samples_lie_where_they_say(measure, jittered):
     for ray in range(COUNT):
         along = points["t"][points["rays"] == ray]
         assert np.all(np.diff(along) > 0)
-        assert_array_equal(points["slots"][points["rays"] == ray], np.arange(len(along)))
 
 
 @pytest.mark.parametrize("cone", [0.0, 0.3])
@@ -164,7 +166,7 @@ def test_long_rays_are_coarsened_and_say_so():
     config = SamplerConfig(measure="euclidean", step=0.5, max_samples_per_ray=4)
     samples = sample(segments_of([(0, 0.0, 2.0)], [(0, 0.0, 2.5)], []), config, "euclidean")
     assert_array_equal(samples.coarsened, [False, True, False])
-    assert_array_equal(samples.counts, [4, 4, 0])
+    assert_array_equal(per_ray(samples), [4, 4, 0])
     assert_allclose(used(samples)["deltas"], [0.5] * 4 + [0.625] * 4, atol=1e-6)
     assert not np.any(samples.overflow)
 
@@ -173,14 +175,13 @@ def test_a_full_buffer_is_reported_and_keeps_the_first_samples():
     segments = segments_of(*[[(r, 0.0, 2.0)] for r in range(4)])  # 4 samples each, room for 12
     config = SamplerConfig(measure="euclidean", step=0.5, max_samples_per_ray=8, capacity_per_ray=3)
     samples = sample(segments, config, "euclidean")
-    assert_array_equal(samples.counts, [4, 4, 4, 0])
+    assert_array_equal(per_ray(samples), [4, 4, 4, 0])
     assert_array_equal(samples.overflow, [False, False, False, True])
     config = dataclasses.replace(config, capacity_per_ray=2)
     samples = sample(segments_of([(0, 0.0, 1.5)], [(1, 0.0, 2.0)]), config, "euclidean")
-    assert_array_equal(samples.counts, [3, 1])
+    assert_array_equal(per_ray(samples), [3, 1])
     assert_array_equal(samples.overflow, [False, True])
-    packed = to_grid(samples.t, samples, 8)
-    assert_allclose(packed[:, :4], [[0.25, 0.75, 1.25, 0], [0.25, 0, 0, 0]], atol=1e-6)
+    assert_allclose(used(samples)["t"], [0.25, 0.75, 1.25, 0.25], atol=1e-6)
 
 
 @pytest.mark.parametrize("gap", [0, 1])
@@ -232,59 +233,35 @@ def test_jitter_does_not_depend_on_the_batch():
 
 def test_rays_without_tets_have_no_samples():
     samples = sample(segments_of([], [(1, 0.0, 1.0)], []), CONFIG, "barycentric")
-    assert_array_equal(samples.counts, [0, 4, 0])
-    assert_array_equal(to_grid(samples.t + 1, samples, 64)[0], np.zeros(64))
+    assert_array_equal(per_ray(samples), [0, 4, 0])
     assert np.all(np.asarray(samples.deltas[4:]) == 0)
 
 
-def packed_samples():
+def test_selected_samples_keep_their_order(rng):
     _, _, segments = scene()
     config = dataclasses.replace(CONFIG, capacity_per_ray=16, max_samples_per_ray=48)
-    return sample(segments, config, "barycentric"), 48
-
-
-def test_packed_and_gridded_order_are_inverse(rng):
-    samples, width = packed_samples()
-    values = jnp.asarray(rng.normal(size=samples.t.shape), jnp.float32)
-    grid = np.asarray(to_grid(values, samples, width))
-    count = int(samples.counts.sum())
-    assert 0 < count < len(values)
-    assert_array_equal(from_grid(jnp.asarray(grid), samples)[:count], values[:count])
-    assert_array_equal(from_grid(jnp.asarray(grid), samples)[count:], 0)
-    for ray in range(COUNT):
-        assert_array_equal(grid[ray, samples.counts[ray] :], 0)
-
-
-@pytest.mark.parametrize("rest", [(), (3,)])
-def test_gradient_of_the_grid_is_that_of_a_plain_gather(rest, rng):
-    samples, width = packed_samples()
-    values = jnp.asarray(rng.normal(size=(*samples.t.shape, *rest)), jnp.float32)
-    mix = jnp.asarray(rng.normal(size=(COUNT, width, *rest)), jnp.float32)
-
-    def plain(values):
-        slots = jnp.arange(width)
-        mask = slots < samples.counts[:, None]
-        taken = values[jnp.where(mask, samples.starts[:, None] + slots, 0)]
-        return jnp.sum(mix * jnp.where(mask.reshape(*mask.shape, *(1,) * len(rest)), taken, 0))
-
-    custom = jax.grad(lambda v: jnp.sum(mix * to_grid(v, samples, width)))(values)
-    assert_allclose(custom, jax.grad(plain)(values), atol=1e-6)
-
-
-def test_selected_samples_keep_their_order(rng):
-    samples, width = packed_samples()
+    samples = sample(segments, config, "barycentric")
     keep = jnp.asarray(rng.uniform(size=samples.t.shape) < 0.4)
-    selected = select_samples(samples, keep)
-    count = int(samples.counts.sum())
-    expected = np.flatnonzero(np.asarray(keep)[:count])
-    points = used(selected)
-    assert_array_equal(points["t"], np.asarray(samples.t)[expected])
-    assert_array_equal(points["deltas"], np.asarray(samples.deltas)[expected])
-    grid = np.asarray(to_grid(selected.t, selected, width))
-    for ray in range(COUNT):
-        mine = expected[np.asarray(samples.rays)[expected] == ray]
-        assert_array_equal(grid[ray, : len(mine)], np.asarray(samples.t)[mine])
-        assert not np.any(grid[ray, len(mine) :])
+    values = jnp.asarray(rng.normal(size=(*samples.t.shape, 3)), jnp.float32)
+    selected, their_values = jax.jit(select_samples)(samples, keep, values)
+    expected = np.flatnonzero(np.asarray(keep)[: int(samples.num_used)])
+    assert 0 < len(expected) < int(samples.num_used) < len(keep)
+    assert int(selected.num_used) == len(expected)
+    for name, kept in used(selected).items():
+        assert_array_equal(kept, np.asarray(getattr(samples, name))[expected])
+    assert_array_equal(their_values[: len(expected)], values[expected])
+    assert not np.any(np.asarray(selected.deltas)[len(expected) :])
+
+
+@pytest.mark.parametrize("cone", [0.0, 0.3])
+def test_samples_are_in_the_segment_that_holds_their_place(cone, rng):
+    """Whatever the jitter: the place along the ray says which tet, not the order of the segments."""
+    cuts = [0.0, *np.sort(rng.uniform(0, 3, 7)), 3.0]
+    segments = segments_of([(k, *ends) for k, ends in enumerate(itertools.pairwise(cuts))], slots=8)
+    config = dataclasses.replace(CONFIG, measure="euclidean", step=0.1, cone_angle=cone)
+    for jitter in rng.uniform(size=(20, 1)).astype(np.float32):
+        points = used(sample(segments, config, "euclidean", jnp.asarray(jitter)))
+        assert_array_equal(points["tet_ids"], np.searchsorted(cuts, points["t"], side="right") - 1)
 
 
 def test_positions_are_differentiable(x64, rng):

@@ -27,6 +27,7 @@ from nimpostor_jax.train.step import (
     learning_rate,
     loss_gradient,
     make_optimizer,
+    occupied_cells,
     train_step,
     trainable,
     with_parameters,
@@ -68,7 +69,7 @@ def stepper(gradient=loss_gradient):
 
 def run(steps):
     impostor, batch = scene()
-    state, losses = init_state(impostor, OPTIMIZER), []
+    state, losses = init_state(impostor, OPTIMIZER, cells_per_edge=4), []
     for _ in range(steps):
         state, metrics = stepper()(state, impostor, batch, RATE)
         losses.append(float(metrics["loss"]))
@@ -101,11 +102,39 @@ def test_every_parameter_group_is_trained():
             assert np.any(np.asarray(old) != np.asarray(new))
 
 
+def test_cells_that_no_ray_sees_are_forgotten_and_found_again():
+    impostor, batch = scene()
+    config = dataclasses.replace(RENDER, min_weight=1e-3)
+    step = jax.jit(
+        functools.partial(train_step, config=config, optimizer=OPTIMIZER, forget_after=3), donate_argnums=()
+    )
+    state, shares = init_state(impostor, OPTIMIZER, cells_per_edge=4), []
+    for _ in range(6):
+        state, metrics = step(state, impostor, batch, RATE)
+        shares.append(float(np.mean(occupied_cells(state, 3))))
+    assert set(metrics) == {"loss", "overflow", "coarsened"}
+    assert shares[:2] == [1, 1]
+    assert 0 < shares[-1] < 1  # 32 rays do not pass through all cells
+    blind = dataclasses.replace(state, last_seen=jnp.full_like(state.last_seen, -100))
+    all_looking = dataclasses.replace(batch, jitter=jnp.zeros_like(batch.jitter))
+    after, _ = step(blind, impostor, all_looking, RATE)
+    assert np.mean(occupied_cells(after, 3)) > 0
+
+
+def test_large_cages_get_fewer_cells(monkeypatch):
+    impostor, _ = scene()
+    monkeypatch.setattr("nimpostor_jax.train.step.MAX_CELLS", 200)
+    num_tets = len(impostor.mesh.tets)
+    shape = init_state(impostor, OPTIMIZER, cells_per_edge=16).last_seen.shape
+    assert shape[0] == num_tets
+    assert num_tets * shape[1] <= 200
+
+
 def test_two_devices_give_the_step_of_one():
     impostor, batch = scene()
     mesh = device_mesh(jax.devices()[:2])
     assert mesh.size == 2
-    state = init_state(impostor, OPTIMIZER)
+    state = init_state(impostor, OPTIMIZER, cells_per_edge=4)
     single, single_metrics = stepper()(state, impostor, batch, RATE)
     placed, shared = jax.device_put((state, impostor), replicated(mesh))
     split = jax.device_put(batch, over_rays(mesh))
@@ -114,6 +143,7 @@ def test_two_devices_give_the_step_of_one():
         assert_allclose(double_metrics[name], value, rtol=1e-5)
     # Adam's first step is the gradient's sign times the rate: compare what it is made of, the first moments,
     # which are sums over rays in another order.
+    assert_array_equal(single.last_seen, double.last_seen)
     for a, b in zip(jax.tree.leaves(single.optimizer), jax.tree.leaves(double.optimizer), strict=True):
         assert_allclose(b, a, rtol=1e-4, atol=1e-7)
 
@@ -130,7 +160,7 @@ def test_a_perfect_target_has_no_loss():
     output = jax.jit(render_rays, static_argnames="config")(impostor, batch.rays, RENDER, batch.jitter)
     target = jnp.column_stack([output.color, output.opacity])
     _, metrics = stepper()(
-        init_state(impostor, OPTIMIZER), impostor, dataclasses.replace(batch, target=target), RATE
+        init_state(impostor, OPTIMIZER, cells_per_edge=4), impostor, dataclasses.replace(batch, target=target), RATE
     )
     assert metrics["loss"] < 1e-10  # float32 roundings, squared
 

@@ -54,17 +54,20 @@ def encode(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""] | int | None = None,
+    known: Float[Array, "M L*F"] | None = None,
 ) -> Float[Array, "M L*F"]:
     """Features f_p of points given by tet and barycentric coordinates, all levels concatenated (Eq. 6).
 
     Differentiable in the tables and, between grid nodes, in the coordinates, in reverse mode. Where only the
-    first `num_used` points matter, no more than their chunks are computed; the rest is 0.
+    first `num_used` points matter, no more than their chunks are computed; the rest is 0. Where the result is
+    `known` from an earlier pass, it is returned as it is, and only its gradient is left to compute.
     """
     num_points = tet_ids.shape[0]
     chunk = default_chunk(num_points)
     used = jnp.asarray(num_points if num_used is None else num_used, jnp.int32)
     tet_ids, lambdas = pad_items((tet_ids, lambdas), chunk)
-    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used)[:num_points]
+    known = known if known is None else pad_items(known, chunk)
+    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used, known)[:num_points]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -76,8 +79,11 @@ def _encode(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""],
+    known: Float[Array, "M L*F"] | None,
 ) -> Float[Array, "M L*F"]:
     """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best."""
+    if known is not None:
+        return known
 
     def encode_chunk(start: Array, out: Array) -> Array:
         points = _points(layout, take(tet_ids, start, chunk))
@@ -142,7 +148,7 @@ def _encode_backward(
 
     zeros = jax.tree.map(jnp.zeros_like, moving)
     d_features, d_lambdas = for_chunks(num_used, chunk, encode_chunk, zeros)
-    return d_features, None, None, d_lambdas, None
+    return d_features, None, None, d_lambdas, None, None
 
 
 _encode.defvjp(_encode_forward, _encode_backward, symbolic_zeros=True)

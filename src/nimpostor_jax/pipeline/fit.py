@@ -35,6 +35,7 @@ from nimpostor_jax.train.step import (
     learning_rate,
     loss_gradient,
     make_optimizer,
+    occupied_cells,
     train_step,
     with_parameters,
 )
@@ -85,7 +86,8 @@ def fit(
     config = scene.config.train
     devices = _usable_devices(config)
     optimizer = make_optimizer()
-    state, progress = init_state(scene.impostor, optimizer), Progress()
+    state = init_state(scene.impostor, optimizer, config.cells_per_edge)
+    progress = Progress()
     checkpoints = Path(workdir) / "checkpoints" if workdir is not None else None
     identity = {"cage": cage_fingerprint(scene.impostor.mesh)}
     if checkpoints is not None and latest_step(checkpoints) is not None:
@@ -109,7 +111,9 @@ def fit(
     render = scene.render
     for _ in range(progress.growths):
         render = _grow(render)
-    step_function = partial(train_step, optimizer=optimizer, gradient=gradient)
+    step_function = partial(
+        train_step, optimizer=optimizer, forget_after=config.forget_after, gradient=gradient
+    )
     compiled = jax.jit(step_function, static_argnames="config", donate_argnums=0)
     key = jax.random.key(config.seed + 1)
     records = _LogFile(Path(workdir) / "log.csv" if workdir is not None else None, progress.step)
@@ -150,13 +154,13 @@ def fit(
                 save()
                 clock = time.perf_counter()
             if callback is not None and config.eval_every and progress.step % config.eval_every == 0:
-                callback(_trained(scene.impostor, state, devices), progress.step)
+                callback(_trained(scene, state, devices), progress.step)
                 clock = time.perf_counter()
         save()
     finally:
         bar.close()
         records.close()
-    return _trained(scene.impostor, state, devices), progress
+    return _trained(scene, state, devices), progress
 
 
 _SYNC_EVERY = 8  # steps that may be under way at once
@@ -167,8 +171,10 @@ def _usable_devices(config: TrainConfig) -> Sequence[jax.Device]:
     return devices if config.rays_per_batch % len(devices) == 0 else devices[:1]
 
 
-def _trained(impostor: NeuralImpostor, state: TrainState, devices: Sequence[jax.Device]) -> NeuralImpostor:
-    return with_parameters(impostor, jax.device_put(state.parameters, devices[0]))
+def _trained(scene: Scene, state: TrainState, devices: Sequence[jax.Device]) -> NeuralImpostor:
+    occupied = occupied_cells(state, scene.config.train.forget_after)
+    parameters, occupied = jax.device_put((state.parameters, occupied), devices[0])
+    return dataclasses.replace(with_parameters(scene.impostor, parameters), occupied=occupied)
 
 
 def _grow(config: RenderConfig) -> RenderConfig:

@@ -5,6 +5,7 @@ from functools import cache, partial
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
@@ -18,6 +19,7 @@ from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays, RenderOutput
 
 CHUNK = 8192  # rays a call
+MAX_REFINEMENT = 32  # of the steps, to meet a tolerance
 REPAIR_CHUNK = 1024  # rays a call with buffers of the largest size
 
 
@@ -28,6 +30,7 @@ class Frame(NamedTuple):
     opacity: Float[np.ndarray, "H W"]
     depth: Float[np.ndarray, "H W"]
     coarsened: Bool[np.ndarray, "H W"]
+    error: Float[np.ndarray, "H W"] | None = None  # estimated, where a tolerance was given
 
 
 _march_tables = jax.jit(march_tables)
@@ -60,63 +63,119 @@ def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     return fit_capacities(impostor.mesh, tables, probe, config)
 
 
-def render_frame(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> Frame:
+def render_frame(
+    impostor: NeuralImpostor, camera: Camera, config: RenderConfig, tolerance: float | None = None
+) -> Frame:
     """Render one camera.
 
     Only pixels whose rays hit the cage are shaded, `CHUNK` at a time, so memory does not grow with the image
-    beyond its output; a chunk's rays are split over all local devices. Rays whose buffers overflow are
-    rendered again, fewer at a time, in larger ones; raises RuntimeError where 2**6 times the given sizes do
-    not suffice.
+    beyond its rays and output; a chunk's rays are split over all local devices. Rays whose buffers overflow
+    are rendered again, fewer at a time, in larger ones; raises RuntimeError where 2**6 times the given sizes
+    do not suffice.
+
+    With a `tolerance`, each pixel's steps are halved until halving changes neither its colour nor its opacity
+    by more than half of that; the last change is returned as `error`. It stays above where steps of
+    1 / `MAX_REFINEMENT` are too long. Samples below `min_weight` are left out all the same.
     """
     height, width = camera.height, camera.width
-    tables = _march_tables(impostor.mesh)
-    rays = _tiled_rays(camera, height, width)
-    entries = ray_entries(impostor.mesh, tables, rays, config.march)
-    pending = np.flatnonzero(np.asarray(entries.holds)[:, 0] >= 0)
-    order = tile_order(height, width)
-    dtype, pixels = impostor.mesh.vertices.dtype, height * width
-    frame = Frame(
-        color=np.zeros((pixels, 3), dtype),
-        opacity=np.zeros(pixels, dtype),
-        depth=np.zeros(pixels, dtype),
-        coarsened=np.zeros(pixels, bool),
-    )
-    render = _Renderer(impostor, tables)
-    chunk = CHUNK * render.num_devices
-    for _ in range(MAX_GROWTH + 1):
-        chunks, outputs = _spread(pending, chunk), []
-        for chosen in chunks:
-            padded = np.concatenate([chosen, np.full(chunk - len(chosen), chosen[-1])])
-            part = jax.tree.map(lambda x, p=padded: x[p], (rays, entries))
-            outputs.append(render(part[0], part[1], config))
-        overflowed = []
-        for chosen, output in zip(chunks, outputs, strict=True):
-            for name, target in frame._asdict().items():
-                target[order[chosen]] = np.asarray(getattr(output, name))[: len(chosen)]
-            overflowed.append(chosen[np.asarray(output.overflow)[: len(chosen)]])
-        pending = np.concatenate(overflowed) if overflowed else pending[:0]
-        if not pending.size:
-            return Frame(*(x.reshape(height, width, *x.shape[1:]) for x in frame))
-        config, chunk = _grow(config), REPAIR_CHUNK * render.num_devices
-        entries = None  # the larger config has more slots for them
-    raise RuntimeError(
-        f"{pending.size} rays need more than {config.march.max_tets_per_ray} tets or "
-        f"{config.march.max_entries_per_ray} entries; raise MarchConfig's sizes"
-    )
+    if tolerance is not None:
+        if not tolerance > 0:
+            raise ValueError(f"tolerance must be > 0, got {tolerance}")
+        most = MAX_REFINEMENT * config.sampler.max_samples_per_ray
+        sampler = dataclasses.replace(config.sampler, max_samples_per_ray=most)
+        config = dataclasses.replace(config, sampler=sampler)
+    view = _View(impostor, camera, config)
+    pixels, order = view.hits, tile_order(height, width)
+    output = view.render(pixels)
+    frame = {name: np.zeros((height * width, *x.shape[1:]), x.dtype) for name, x in output.items()}
+    frame["error"] = np.zeros(height * width, output["opacity"].dtype)
+
+    def write(pixels: np.ndarray, values: dict[str, np.ndarray]) -> None:
+        for name, value in values.items():
+            frame[name][order[pixels]] = value
+
+    write(pixels, output)
+    refinement = 2
+    while tolerance is not None and pixels.size and refinement <= MAX_REFINEMENT:
+        finer = view.render(pixels, refinement)
+        change = np.abs(np.column_stack([finer[name] - output[name] for name in ("color", "opacity")]))
+        finer["error"] = change.max(axis=1)
+        write(pixels, finer)
+        pending = finer["error"] > tolerance / 2
+        pixels, output = pixels[pending], {name: value[pending] for name, value in finer.items()}
+        refinement *= 2
+    if tolerance is None:
+        del frame["error"]
+    return Frame(**{name: x.reshape(height, width, *x.shape[1:]) for name, x in frame.items()})
 
 
-class _Renderer:
-    """`render_rays` with the rays split over the local devices, compiled once for all of them."""
+class _View:
+    """A camera's rays, and `render_rays` of any of them on all local devices, compiled once."""
 
-    def __init__(self, impostor: NeuralImpostor, tables: MarchTables):
+    def __init__(self, impostor: NeuralImpostor, camera: Camera, config: RenderConfig):
+        self._impostor, self._config = impostor, config
+        self._tables = _march_tables(impostor.mesh)
+        self._rays = _tiled_rays(camera, camera.height, camera.width)
+        self._entries = ray_entries(impostor.mesh, self._tables, self._rays, config.march)
+        self.hits = np.flatnonzero(np.asarray(self._entries.holds)[:, 0] >= 0)
         mesh = _device_mesh()
-        self.num_devices = mesh.size
-        self._replicas = jax.device_put((impostor, tables), NamedSharding(mesh, P()))
-        self._rays = NamedSharding(mesh, P("rays"))
+        self._num_devices = mesh.size
+        self._replicas = jax.device_put((impostor, self._tables), NamedSharding(mesh, P()))
+        self._by_ray = NamedSharding(mesh, P("rays"))
 
-    def __call__(self, rays: Rays, entries: Entries | None, config: RenderConfig) -> RenderOutput:
-        """Start rendering; the number of rays is a multiple of the number of devices."""
-        return _render_sharded(*self._replicas, *jax.device_put((rays, entries), self._rays), config)
+    def render(self, pixels: np.ndarray, refinement: int = 1) -> dict[str, np.ndarray]:
+        """Outputs [len(pixels), ...] by name, with steps divided by `refinement`."""
+        config, chunk, first = self._config, CHUNK * self._num_devices, True
+        results = _empty_outputs(len(pixels), self._impostor.mesh.vertices.dtype)
+        pending = np.arange(len(pixels))
+        for _ in range(MAX_GROWTH + 1):
+            # Finer steps need more room: fewer rays share the buffers, so that nothing compiles again.
+            share = chunk if refinement == 1 else chunk // (2 * refinement)
+            parts = _spread(pending, share)
+            outputs = [self._render_chunk(pixels[part], chunk, config, refinement, first) for part in parts]
+            overflowed = [pending[:0]]
+            for part, output in zip(parts, outputs, strict=True):
+                for name, target in results.items():
+                    target[part] = np.asarray(getattr(output, name))[: len(part)]
+                overflowed.append(part[np.asarray(output.overflow)[: len(part)]])
+            pending = np.concatenate(overflowed)
+            if not pending.size:
+                return results
+            config, chunk, first = _grow(config), REPAIR_CHUNK * self._num_devices, False
+        raise RuntimeError(
+            f"{pending.size} rays need more than {config.march.max_tets_per_ray} tets or "
+            f"{config.march.max_entries_per_ray} entries; raise MarchConfig's sizes"
+        )
+
+    def _render_chunk(
+        self, pixels: np.ndarray, chunk: int, config: RenderConfig, refinement: int, known_entries: bool
+    ) -> RenderOutput:
+        """Start rendering a chunk; rays that fill it up enter nothing and cost nothing."""
+        padded = np.concatenate([pixels, np.full(chunk - len(pixels), pixels[-1])])
+        rays = jax.tree.map(lambda x: x[padded], self._rays)
+        if known_entries:
+            entries = jax.tree.map(lambda x: x[padded], self._entries)
+        else:
+            entries = ray_entries(self._impostor.mesh, self._tables, rays, config.march)
+        used = np.arange(chunk) < len(pixels)
+        entries = dataclasses.replace(
+            entries,
+            holds=jnp.where(used[:, None], entries.holds, -1),
+            overflow=entries.overflow & used,
+            unsure=entries.unsure & used,
+        )
+        refinements = jnp.full(chunk, refinement, rays.origins.dtype)
+        placed = jax.device_put((rays, entries, refinements), self._by_ray)
+        return _render_sharded(*self._replicas, *placed, config)
+
+
+def _empty_outputs(count: int, dtype: np.dtype) -> dict[str, np.ndarray]:
+    return {
+        "color": np.zeros((count, 3), dtype),
+        "opacity": np.zeros(count, dtype),
+        "depth": np.zeros(count, dtype),
+        "coarsened": np.zeros(count, bool),
+    }
 
 
 @cache
@@ -130,22 +189,27 @@ def _render_sharded(
     impostor: NeuralImpostor,
     tables: MarchTables,
     rays: Rays,
-    entries: Entries | None,
+    entries: Entries,
+    refinement: Float[jax.Array, " R"],
     config: RenderConfig,
 ) -> RenderOutput:
     @partial(
         jax.shard_map,
         mesh=_device_mesh(),
-        in_specs=(P(), P(), P("rays"), P("rays")),
+        in_specs=(P(), P(), P("rays"), P("rays"), P("rays")),
         out_specs=P("rays"),
         check_vma=False,
     )
     def shard(
-        impostor: NeuralImpostor, tables: MarchTables, rays: Rays, entries: Entries | None
+        impostor: NeuralImpostor,
+        tables: MarchTables,
+        rays: Rays,
+        entries: Entries,
+        refinement: Float[jax.Array, " R"],
     ) -> RenderOutput:
-        return render_rays(impostor, rays, config, tables=tables, entries=entries)
+        return render_rays(impostor, rays, config, tables=tables, entries=entries, refinement=refinement)
 
-    return shard(impostor, tables, rays, entries)
+    return shard(impostor, tables, rays, entries, refinement)
 
 
 def _spread(rays: np.ndarray, chunk: int) -> list[np.ndarray]:
@@ -153,7 +217,7 @@ def _spread(rays: np.ndarray, chunk: int) -> list[np.ndarray]:
     tile = TILE * TILE
     tiles = [rays[i : i + tile] for i in range(0, len(rays), tile)]
     order = np.random.default_rng(0).permutation(len(tiles))
-    per_chunk = chunk // tile
+    per_chunk = max(1, chunk // tile)
     hands = [order[i : i + per_chunk] for i in range(0, len(order), per_chunk)]
     return [np.concatenate([tiles[j] for j in hand]) for hand in hands]
 

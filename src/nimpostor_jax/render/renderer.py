@@ -4,20 +4,15 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from nimpostor_jax.chunks import map_used
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sample_weights
-from nimpostor_jax.render.sampling import (
-    Samples,
-    from_grid,
-    sample_segments,
-    select_samples,
-    to_grid,
-)
+from nimpostor_jax.render.occupancy import in_occupied_cells
+from nimpostor_jax.render.sampling import Samples, sample_segments, select_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, RenderOutput
@@ -30,6 +25,7 @@ def render_rays(
     jitter: Float[Array, " R"] | None = None,
     tables: MarchTables | None = None,
     entries: Entries | None = None,
+    refinement: Float[Array, " R"] | None = None,
 ) -> RenderOutput:
     """Colour, opacity and depth of rays [R] given in world space. Pure; jit it with `config` static.
 
@@ -37,24 +33,54 @@ def render_rays(
     in [0, 1) samples move within their steps (training); without, they sit in the middle. Pass `tables` to
     spare rearranging the mesh in every call; by default they are made from the mesh's current vertices. Pass
     the rays' `entries` (`traverse.find_entries`) where the same rays see the same mesh again.
+    `refinement` divides the steps of each ray.
     """
+    return render_samples(impostor, rays, config, jitter, tables, entries, refinement)[0]
+
+
+def render_samples(
+    impostor: NeuralImpostor,
+    rays: Rays,
+    config: RenderConfig,
+    jitter: Float[Array, " R"] | None = None,
+    tables: MarchTables | None = None,
+    entries: Entries | None = None,
+    refinement: Float[Array, " R"] | None = None,
+) -> tuple[RenderOutput, Samples]:
+    """`render_rays`, and the samples of which the colours are made."""
     local = to_local(impostor.mesh, rays)
     near = config.near / impostor.mesh.scale
     if tables is None:
         tables = march_tables(impostor.mesh)
     crossings = traverse(tables, local, config.march, entries)
     segments = locate_segments(impostor.mesh, local, crossings, near)
-    samples = sample_segments(segments, config.sampler, config.density_measure, jitter)
-    return _integrate(impostor, local, samples, segments.overflow, config)
+    samples = sample_segments(segments, config.sampler, config.density_measure, jitter, refinement)
+    if config.skip_empty and impostor.occupied is not None:
+        keep = in_occupied_cells(impostor.occupied, samples.tet_ids, samples.lambdas)
+        if jitter is not None:
+            keep |= _looks_everywhere(jitter)[samples.rays]
+        samples, _ = select_samples(samples, keep)
+    known = None
+    if config.min_weight > 0:
+        samples, known = _visible(impostor, samples, config)
+    return _integrate(impostor, local, samples, known, segments.overflow, config), samples
+
+
+def _looks_everywhere(jitter: Float[Array, " R"]) -> Bool[Array, " R"]:
+    """One ray in sixteen, by digits of its jitter that hardly move its samples: cells fill up."""
+    return (jitter * 1024) % 1 < 1 / 16
 
 
 def _integrate(
-    impostor: NeuralImpostor, rays: Rays, samples: Samples, overflow: Array, config: RenderConfig
+    impostor: NeuralImpostor,
+    rays: Rays,
+    samples: Samples,
+    known: Float[Array, "M C"] | None,
+    overflow: Array,
+    config: RenderConfig,
 ) -> RenderOutput:
-    if config.min_weight > 0:
-        samples = _visible(impostor, samples, config)
-    num_used = jnp.sum(samples.counts)
-    point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used)
+    num_used = samples.num_used
+    point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used, known)
     directions = field.encode_directions(impostor, rays.directions)
 
     def decode(shared: tuple, part: tuple) -> tuple[Array, Array]:
@@ -63,11 +89,11 @@ def _integrate(
         return sigmas, field.radiance(decoders, tet_ids, features, directions[rays])
 
     # Without tables and mesh, or `map_used` would add up gradients of their size for every chunk.
-    decoders = dataclasses.replace(impostor, mesh=None, tables=None)  # type: ignore[arg-type]
+    decoders = dataclasses.replace(impostor, mesh=None, tables=None, occupied=None)  # type: ignore[arg-type]
     items = (samples.tet_ids, point_features, samples.rays)
     sigmas, colors = map_used(decode, (decoders, directions), items, num_used)
 
-    weights = _weights(sigmas, samples, config)
+    weights = _weights(sigmas, samples)
     sums = jax.ops.segment_sum(
         weights[:, None] * jnp.column_stack([colors, jnp.ones_like(weights), samples.t]),
         samples.rays,
@@ -84,22 +110,24 @@ def _integrate(
     )
 
 
-def _weights(sigmas: Float[Array, " M"], samples: Samples, config: RenderConfig) -> Float[Array, " M"]:
+def _weights(sigmas: Float[Array, " M"], samples: Samples) -> Float[Array, " M"]:
     """Share of its ray's light that each packed sample contributes."""
-    optical_depth = to_grid(sigmas * samples.deltas, samples, config.sampler.max_samples_per_ray)
-    return from_grid(sample_weights(optical_depth), samples)
+    return sample_weights(sigmas * samples.deltas, samples.rays)
 
 
-def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig) -> Samples:
-    """The samples that contribute at least `min_weight`, found by a pass over densities without gradient.
+def _visible(
+    impostor: NeuralImpostor, samples: Samples, config: RenderConfig
+) -> tuple[Samples, Float[Array, "M C"]]:
+    """The samples that contribute at least `min_weight`, found by a pass without gradient; their features.
 
     Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
     """
     frozen, seen = jax.lax.stop_gradient((impostor, samples))
 
-    def densities(frozen: NeuralImpostor, part: tuple) -> Array:
+    def evaluate(frozen: NeuralImpostor, part: tuple) -> tuple[Array, Array]:
         tet_ids, lambdas = part
-        return field.density(frozen, tet_ids, field.features(frozen, tet_ids, lambdas))
+        point_features = field.features(frozen, tet_ids, lambdas)
+        return field.density(frozen, tet_ids, point_features), point_features
 
-    sigmas = map_used(densities, frozen, (seen.tet_ids, seen.lambdas), jnp.sum(seen.counts))
-    return select_samples(samples, _weights(sigmas, seen, config) >= config.min_weight)
+    sigmas, point_features = map_used(evaluate, frozen, (seen.tet_ids, seen.lambdas), seen.num_used)
+    return select_samples(samples, _weights(sigmas, seen) >= config.min_weight, point_features)

@@ -2,10 +2,12 @@
 
 A ray's samples are spaced evenly, or with Eq. 4's cone growth, in a measure that accumulates over its tets.
 Rays need different numbers of samples: they share a buffer of M slots, so that nothing is computed for
-samples that a ray does not have. `to_grid` and `from_grid` change between the packed order and [R, S].
+samples that a ray does not have.
 
 Axes: R rays, K tet slots, S samples a ray at most, M packed samples.
 """
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
+from nimpostor_jax.chunks import map_used, packed_indices
 from nimpostor_jax.config import Measure, SamplerConfig
 from nimpostor_jax.types import TetSegments
 
@@ -28,9 +31,7 @@ class Samples:
     t: Float[Array, " M"]
     deltas: Float[Array, " M"]  # length of the sample's interval in the density measure; 0 in unused slots
     rays: Int[Array, " M"]
-    slots: Int[Array, " M"]  # position along the ray
-    starts: Int[Array, " R"]  # packed index of the ray's first sample
-    counts: Int[Array, " R"]  # samples of the ray that fit into the buffer
+    num_used: Int[Array, ""]
     overflow: Bool[Array, " R"]  # some of the ray's samples did not fit
     coarsened: Bool[Array, " R"]  # the ray needed more than S samples and got larger steps
 
@@ -58,12 +59,13 @@ def sample_segments(
     config: SamplerConfig,
     density_measure: Measure,
     jitter: Float[Array, " R"] | None = None,
+    refinement: Float[Array, " R"] | None = None,
 ) -> Samples:
     """Place samples on each ray: at the middle of each step, or stratified within it where `jitter` is given.
 
     `jitter` in [0, 1) is one number a ray; its samples' places follow by golden-ratio steps, so that they
     depend neither on the batch around the ray nor on the number of devices. Steps are scaled down so that a
-    whole number of them fills the ray exactly. Empty rays get no samples.
+    whole number of them fills the ray exactly. Empty rays get no samples. `refinement` divides a ray's steps.
     """
     num_rays, max_samples = segments.tet_ids.shape[0], config.max_samples_per_ray
     capacity = num_rays * (config.capacity_per_ray or max_samples)
@@ -72,24 +74,25 @@ def sample_segments(
     total = ends[:, -1]
     boundaries = jnp.asarray(step_boundaries(config), ends.dtype)
     # The tolerance keeps a ray of exactly n steps from getting n + 1 by rounding.
-    fits = jnp.searchsorted(boundaries, jax.lax.stop_gradient(total) * (1 - 1e-5)).astype(jnp.int32)
+    asked = jax.lax.stop_gradient(total if refinement is None else total * refinement)
+    fits = jnp.searchsorted(boundaries, asked * (1 - 1e-5)).astype(jnp.int32)
     wanted = jnp.where(total > 0, jnp.clip(fits, 1, max_samples), 0)
     scale = total / boundaries[jnp.maximum(wanted, 1)]
+    counts = jnp.clip(capacity - (jnp.cumsum(wanted) - wanted), 0, wanted)
+    before = _samples_before(config, ends, extents, boundaries, scale, counts, jitter)
+    in_segment = jnp.diff(before, axis=1, prepend=0).reshape(-1)
 
-    firsts = jnp.cumsum(wanted) - wanted
-    counts = jnp.clip(capacity - firsts, 0, wanted)
-    rays = jnp.repeat(jnp.arange(num_rays, dtype=jnp.int32), counts, total_repeat_length=capacity)
-    slots = jnp.arange(capacity, dtype=jnp.int32) - firsts[rays]
-    used = slots < counts[rays]
-    slots = jnp.where(used, slots, 0)
-
+    flat = jnp.arange(in_segment.size, dtype=jnp.int32)
+    segment = jnp.repeat(flat, in_segment, total_repeat_length=capacity)
+    packed, num_used = jnp.arange(capacity, dtype=jnp.int32), jnp.sum(counts)
+    used = packed < num_used
+    rays = segment // segments.tet_ids.shape[1]
+    slots = jnp.clip(packed - (jnp.cumsum(counts) - counts)[rays], 0, max_samples - 1)
     low, high = boundaries[slots], boundaries[slots + 1]
-    share = 0.5 if jitter is None else (jitter[rays] + GOLDEN_RATIO * slots) % 1
-    position = (low + share * (high - low)) * scale[rays]
-    segment = _find_segment(ends, extents, rays, position)
+    position = (low + _share(slots, jitter, rays) * (high - low)) * scale[rays]
 
     def pick(values: Float[Array, "R K *rest"]) -> Float[Array, "M *rest"]:
-        return values[rays, segment]
+        return values.reshape(-1, *values.shape[2:])[segment]
 
     extent, end = pick(extents), pick(ends)
     inside = jnp.clip(1 - (end - position) / jnp.where(extent > 0, extent, 1), 0, 1)
@@ -105,93 +108,63 @@ def sample_segments(
         t=t_enter + inside * (t_exit - t_enter),
         deltas=jnp.where(used, deltas, 0),
         rays=rays,
-        slots=slots,
-        starts=jnp.minimum(firsts, capacity - 1),
-        counts=counts,
+        num_used=num_used,
         overflow=counts < wanted,
         coarsened=fits > max_samples,
     )
 
 
-def _find_segment(
+def _share(
+    slots: Int[Array, "*batch"], jitter: Float[Array, " R"] | None, rays: Int[Array, "*batch"]
+) -> Float[Array, "*batch"] | float:
+    """Where in its step a ray's sample is."""
+    return 0.5 if jitter is None else (jitter[rays] + GOLDEN_RATIO * slots) % 1
+
+
+def _samples_before(
+    config: SamplerConfig,
     ends: Float[Array, "R K"],
     extents: Float[Array, "R K"],
-    rays: Int[Array, " M"],
-    position: Float[Array, " M"],
-) -> Int[Array, " M"]:
-    """The first segment of the ray that ends beyond each position, by bisection; never an empty one."""
-    num_slots = ends.shape[1]
-    ends, extents, position = jax.lax.stop_gradient((ends, extents, position))
-    # A parallel sum need not repeat itself over empty slots; the last position may round to the ray's end.
+    boundaries: Float[Array, " S+1"],
+    scale: Float[Array, " R"],
+    counts: Int[Array, " R"],
+    jitter: Float[Array, " R"] | None,
+) -> Int[Array, "R K"]:
+    """How many of its ray's samples lie before the end of each segment; none lies in an empty one."""
+    # A parallel sum need not repeat itself over empty slots.
     ends = jax.lax.cummax(jnp.where(extents > 0, ends, 0), axis=1)
-    position = jnp.minimum(position, ends[rays, -1] * (1 - 2 * jnp.finfo(ends.dtype).eps))
-    flat, base = ends.reshape(-1), rays * num_slots
-    low = jnp.zeros_like(rays)
-    width = 1 << max(0, (num_slots - 1).bit_length())
-    while width > 1:
-        width //= 2
-        probe = jnp.minimum(low + width, num_slots) - 1
-        low = jnp.where(flat[base + probe] <= position, probe + 1, low)
-    return jnp.minimum(low, num_slots - 1)
+    position = ends / jnp.where(scale > 0, scale, 1)[:, None]
+    if config.cone_angle == 0:
+        step = (position / config.step).astype(jnp.int32)
+    else:
+        step = jnp.searchsorted(boundaries, position, side="right").astype(jnp.int32) - 1
+    step = jnp.clip(step, 0, boundaries.size - 2)
+    rays = jnp.broadcast_to(jnp.arange(len(ends))[:, None], ends.shape)
+    low, high = boundaries[step], boundaries[step + 1]
+    before = step + (low + _share(step, jitter, rays) * (high - low) < position)
+    last = ends >= ends[:, -1:] * (1 - 2 * jnp.finfo(ends.dtype).eps)  # rounding leaves no sample behind it
+    return jnp.where(last, counts[:, None], jnp.minimum(before, counts[:, None]))
 
 
-def select_samples(samples: Samples, keep: Bool[Array, " M"]) -> Samples:
-    """Only the samples to keep, packed at the buffer's start in the same order."""
-    num_rays, capacity = samples.counts.shape[0], samples.t.shape[0]
+def select_samples(samples: Samples, keep: Bool[Array, " M"], values: Any = None) -> tuple[Samples, Any]:
+    """Only the samples to keep, in the same order at the buffer's start; so too `values` [M, ...] of them."""
+    capacity = samples.t.shape[0]
     keep &= samples.deltas > 0
-    counts = jnp.zeros(num_rays, jnp.int32).at[samples.rays].add(keep.astype(jnp.int32))
-    firsts = jnp.cumsum(counts) - counts
-    chosen = jnp.nonzero(keep, size=capacity, fill_value=0)[0]
-    packed = jnp.arange(capacity, dtype=jnp.int32)
-    used = packed < jnp.sum(counts)
-    rays = samples.rays[chosen]
-    return Samples(
-        tet_ids=samples.tet_ids[chosen],
-        lambdas=samples.lambdas[chosen],
-        t=samples.t[chosen],
-        deltas=jnp.where(used, samples.deltas[chosen], 0),
+    chosen, num_used = packed_indices(keep)
+    columns = (samples.tet_ids, samples.lambdas, samples.t, samples.deltas, samples.rays)
+
+    def gather(columns: Any, chosen: Array) -> Any:
+        return jax.tree.map(lambda x: x[chosen], columns)
+
+    (tet_ids, lambdas, t, deltas, rays), values = map_used(gather, (columns, values), chosen, num_used)
+    selected = Samples(
+        tet_ids=tet_ids,
+        lambdas=lambdas,
+        t=t,
+        deltas=jnp.where(jnp.arange(capacity) < num_used, deltas, 0),
         rays=rays,
-        slots=jnp.where(used, packed - firsts[rays], 0),
-        starts=jnp.minimum(firsts, capacity - 1),
-        counts=counts,
+        num_used=num_used,
         overflow=samples.overflow,
         coarsened=samples.coarsened,
     )
-
-
-def to_grid(values: Float[Array, "M *rest"], samples: Samples, max_samples: int) -> Float[Array, "R S *rest"]:
-    """Packed values as [R, S]; zero where a ray has no sample. Linear; its transpose is `from_grid`."""
-    slots = jnp.arange(max_samples, dtype=jnp.int32)
-    used = slots < samples.counts[:, None]
-    index = jnp.where(used, samples.starts[:, None] + slots, 0)
-    return _to_grid(values, index, used, samples.rays * max_samples + samples.slots, samples.deltas > 0)
-
-
-def from_grid(values: Float[Array, "R S"], samples: Samples) -> Float[Array, " M"]:
-    """Values on [R, S] in packed order; zero in unused slots."""
-    return jnp.where(samples.deltas > 0, values[samples.rays, samples.slots], 0)
-
-
-@jax.custom_vjp
-def _to_grid(values, index, used, back_index, back_used):  # type: ignore[no-untyped-def]
-    return jnp.where(used.reshape(used.shape + (1,) * (values.ndim - 1)), values[index], 0)
-
-
-def _to_grid_forward(values, index, used, back_index, back_used):  # type: ignore[no-untyped-def]
-    return _to_grid(values, index, used, back_index, back_used), (back_index, back_used)
-
-
-def _to_grid_backward(residuals, cotangent):  # type: ignore[no-untyped-def]
-    # Packed and gridded samples correspond one to one: the transpose of this gather is a gather.
-    back_index, back_used = residuals
-    flat = cotangent.reshape(-1, *cotangent.shape[2:])[back_index]
-    return (
-        jnp.where(back_used.reshape(-1, *(1,) * (flat.ndim - 1)), flat, 0),
-        None,
-        None,
-        None,
-        None,
-    )
-
-
-_to_grid.defvjp(_to_grid_forward, _to_grid_backward)
+    return selected, values

@@ -8,17 +8,20 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.config import RenderConfig, TrainConfig
 from nimpostor_jax.render.composite import blend_background
-from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.occupancy import cells_of, num_cells
+from nimpostor_jax.render.renderer import render_samples
 from nimpostor_jax.render.traverse import Entries
 from nimpostor_jax.train.losses import photometric
 from nimpostor_jax.types import NeuralImpostor, Rays
 
 Parameters = dict[str, Any]
 Metrics = dict[str, Array]
+
+MAX_CELLS = 1 << 21  # of all tets: 8 MiB of `last_seen`
 
 
 @struct.dataclass
@@ -39,6 +42,7 @@ class TrainState:
     parameters: Parameters  # tables' features and decoders
     optimizer: optax.OptState
     step: Int[Array, ""]
+    last_seen: Int[Array, "T cells"] | None = None  # step at which a cell last contributed to a pixel
 
 
 def trainable(impostor: NeuralImpostor) -> Parameters:
@@ -64,25 +68,48 @@ def learning_rate(config: TrainConfig, progress: float, step: int) -> float:
     return config.learning_rate * warmup * decay
 
 
-def init_state(impostor: NeuralImpostor, optimizer: optax.GradientTransformation) -> TrainState:
-    """The state before the first step."""
-    parameters = trainable(impostor)
+def init_state(
+    impostor: NeuralImpostor, optimizer: optax.GradientTransformation, cells_per_edge: int = 0
+) -> TrainState:
+    """The state before the first step. Of large cages, tets are cut into fewer cells than asked for."""
+    parameters, last_seen = trainable(impostor), None
+    if cells_per_edge:
+        num_tets = impostor.mesh.tets.shape[0]
+        while cells_per_edge > 1 and num_tets * num_cells(cells_per_edge) > MAX_CELLS:
+            cells_per_edge //= 2
+        last_seen = jnp.zeros((num_tets, num_cells(cells_per_edge)), jnp.int32)
     return TrainState(
-        parameters=parameters, optimizer=optimizer.init(parameters), step=jnp.zeros((), jnp.int32)
+        parameters=parameters,
+        optimizer=optimizer.init(parameters),
+        step=jnp.zeros((), jnp.int32),
+        last_seen=last_seen,
     )
+
+
+def occupied_cells(state: TrainState, forget_after: int) -> Bool[Array, "T cells"] | None:
+    """Cells that some ray saw within the last `forget_after` steps."""
+    return None if state.last_seen is None else state.last_seen + forget_after > state.step
 
 
 def render_loss(
     parameters: Parameters, impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig
 ) -> tuple[Float[Array, ""], Metrics]:
-    """Photometric loss of a batch over its backgrounds, and what the driver watches."""
+    """Photometric loss of a batch over its backgrounds, and what the driver watches.
+
+    Where the impostor has an occupancy grid, also the cells that contributed, `seen_cells` [T, C] > 0.
+    """
     impostor = with_parameters(impostor, parameters)
-    output = render_rays(impostor, batch.rays, config, batch.jitter, entries=batch.entries)
+    output, samples = render_samples(impostor, batch.rays, config, batch.jitter, entries=batch.entries)
     color = blend_background(output.color, output.opacity, batch.background)
     target = blend_background(batch.target[:, :3], batch.target[:, 3], batch.background)
     loss = photometric(color, target, output.overflow)
     flags = {"overflow": output.overflow, "coarsened": output.coarsened}
-    return loss, {"loss": loss} | {name: jnp.mean(flag.astype(loss.dtype)) for name, flag in flags.items()}
+    metrics = {"loss": loss} | {name: jnp.mean(flag.astype(loss.dtype)) for name, flag in flags.items()}
+    if impostor.occupied is not None:
+        used = samples.deltas > 0
+        seen = cells_of(samples.tet_ids, samples.lambdas, used, *impostor.occupied.shape)
+        metrics["seen_cells"] = seen.astype(loss.dtype)  # a mean over devices is as good as "any"
+    return loss, metrics
 
 
 def loss_gradient(
@@ -100,14 +127,22 @@ def train_step(
     *,
     config: RenderConfig,
     optimizer: optax.GradientTransformation,
+    forget_after: int = TrainConfig.forget_after,
     gradient: Callable[..., tuple[Parameters, Metrics]] = loss_gradient,
 ) -> tuple[TrainState, Metrics]:
     """One optimiser step at learning rate `rate`.
 
-    `impostor` gives cage and layout; its own tables and decoders are not read. `gradient` may be a sharded
-    `loss_gradient` (`sharding.data_parallel`).
+    `impostor` gives cage and layout; its own tables and decoders are not read. Cells that no ray has seen for
+    `forget_after` steps are left out. `gradient` may be a sharded `loss_gradient` (`sharding.data_parallel`).
     """
+    impostor = dataclasses.replace(impostor, occupied=occupied_cells(state, forget_after))
     gradients, metrics = gradient(state.parameters, impostor, batch, config)
     updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
     parameters = jax.tree.map(lambda p, u: p - rate * u, state.parameters, updates)
-    return TrainState(parameters=parameters, optimizer=optimizer_state, step=state.step + 1), metrics
+    last_seen = state.last_seen
+    if last_seen is not None:
+        seen = metrics.pop("seen_cells")
+        last_seen = jnp.where(seen > 0, state.step, last_seen)
+    return TrainState(
+        parameters=parameters, optimizer=optimizer_state, step=state.step + 1, last_seen=last_seen
+    ), metrics

@@ -1,0 +1,57 @@
+"""Which parts of the tets hold anything, so that samples in empty space and within solids cost little.
+
+Each tet is cut into cells by the integer parts of N lambda_0, N lambda_1 and N lambda_2: a grid that moves
+with the tet. Training records when a cell last contributed to a pixel, and looks into all cells now and then.
+
+Axes: T tets, C = N (N + 1) (N + 2) / 6 cells of a tet, M samples.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+def num_cells(resolution: int) -> int:
+    """C for N parts an edge."""
+    return resolution * (resolution + 1) * (resolution + 2) // 6
+
+
+def cell_resolution(cells: int) -> int:
+    """N for C cells a tet. Raises ValueError where no N has that many."""
+    resolution = round((6 * cells) ** (1 / 3)) - 1
+    if num_cells(resolution) != cells:
+        raise ValueError(f"no resolution has {cells} cells a tet")
+    return resolution
+
+
+def cell_index(
+    tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"], cells: int
+) -> Int[Array, " M"]:
+    """Index into [T * C] of the cell in which each point lies, by the combinatorial number system."""
+    resolution = cell_resolution(cells)
+    i, j, k = (jnp.clip((lambdas[:, n] * resolution).astype(jnp.int32), 0, resolution - 1) for n in range(3))
+    # Rounding may push a point of the face lambda_3 = 0 beyond it.
+    plane = jnp.minimum(j + k, resolution - 1)
+    space = jnp.minimum(i + plane, resolution - 1)
+    k = jnp.minimum(k, plane)
+    index = space * (space + 1) * (space + 2) // 6 + plane * (plane + 1) // 2 + k
+    return tet_ids * cells + index
+
+
+def in_occupied_cells(
+    occupied: Bool[Array, "T C"], tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+) -> Bool[Array, " M"]:
+    """Whether each point lies in an occupied cell."""
+    index = cell_index(tet_ids, lambdas, occupied.shape[1])
+    return occupied.reshape(-1).at[index].get(mode="promise_in_bounds")
+
+
+def cells_of(
+    tet_ids: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
+    used: Bool[Array, " M"],
+    num_tets: int,
+    cells: int,
+) -> Bool[Array, "T C"]:
+    """The cells in which the used points lie."""
+    index = jnp.where(used, cell_index(tet_ids, lambdas, cells), num_tets * cells)
+    return jnp.zeros(num_tets * cells, bool).at[index].set(True, mode="drop").reshape(num_tets, cells)
