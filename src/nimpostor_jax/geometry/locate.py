@@ -28,6 +28,8 @@ MAX_RESOLUTION = 96  # cells a side
 FLOOD_ROUNDS = 4
 WALK_STEPS = 5  # measured: 1 on average; the few points that need more are cheaper in the tree
 CPU_TREE_TILE = 1024  # points that descend the tree together
+HULL_TESTS = 1 << 25  # boundary faces times vertices: for larger meshes the test costs more than the tree
+_HULL = -2  # in place of a neighbour
 _UNSETTLED = -2  # the walk holds -2 - tet while it goes on, the tet when settled, -1 outside
 
 
@@ -36,7 +38,7 @@ class LocateTables:
     """The mesh's current geometry, rearranged for `locate`: made once, used for many calls."""
 
     planes: Float[Array, " 16T"]  # at 16 tet + 4 corner: the face opposite, inward normal and offset
-    neighbors: Int[Array, " 4T"]
+    neighbors: Int[Array, " 4T"]  # -1 outside; -2 where nothing of the mesh lies beyond the face's plane
     seeds: Int[Array, " cells"]  # a tet near the cell's centre; -1 where no tet can reach the cell
     low: Float[Array, " 3"]  # box of the cage
     high: Float[Array, " 3"]
@@ -62,9 +64,10 @@ def locate_tables(mesh: TetMesh) -> LocateTables:
         jnp.where(used, low[leaf_tets], jnp.inf), jnp.where(used, high[leaf_tets], -jnp.inf)
     )
     box_low, box_high = jnp.min(low, axis=0), jnp.max(high, axis=0)
+    planes = _planes(vertices, mesh.tets)
     return LocateTables(
-        planes=_planes(vertices, mesh.tets).reshape(-1),
-        neighbors=mesh.neighbors.reshape(-1),
+        planes=planes.reshape(-1),
+        neighbors=_mark_hull(mesh, vertices, planes, tolerance),
         seeds=_seeds(positions, low - tolerance, high + tolerance, box_low, box_high),
         low=box_low,
         high=box_high,
@@ -97,6 +100,25 @@ def _planes(vertices: Float[Array, "V 3"], tets: Int[Array, "T 4"]) -> Float[Arr
     normal = -outward * normal / jnp.sqrt(jnp.where(valid, squared, 1))
     offset = -jnp.sum(normal * first, axis=-1, keepdims=True)
     return jnp.concatenate([normal, jnp.where(valid, offset, -jnp.inf)], axis=-1)
+
+
+def _mark_hull(
+    mesh: TetMesh, vertices: Float[Array, "V 3"], planes: Float[Array, "T 4 4"], tolerance: Float[Array, ""]
+) -> Int[Array, " 4T"]:
+    """The neighbours, with `_HULL` across boundary faces whose planes have all vertices on one side.
+
+    What lies beyond such a face is outside of the mesh, convex or not, and need not descend the tree.
+    """
+    neighbors = mesh.neighbors.reshape(-1)
+    tets, local = mesh.boundary.tets.reshape(-1), mesh.boundary.corners.reshape(-1)
+    if tets.shape[0] * vertices.shape[0] > HULL_TESTS:
+        return neighbors
+    plane = planes[jnp.maximum(tets, 0), jnp.maximum(local, 0)][:, :, None]  # [faces, 4, 1]
+    x, y, z = (vertices[:, i] for i in range(3))
+    lowest = jnp.min(plane[:, 0] * x + plane[:, 1] * y + plane[:, 2] * z + plane[:, 3], axis=1)
+    on_hull = (tets >= 0) & (lowest >= -tolerance / 2)
+    faces = jnp.where(on_hull, 4 * tets + local, neighbors.shape[0])
+    return neighbors.at[faces].set(_HULL, mode="drop")
 
 
 def _seeds(
@@ -171,6 +193,8 @@ def _walk(tables: LocateTables, points: Float[Array, "N 3"], columns: tuple) -> 
         depth, corner = _depth(tables, columns, tet)
         neighbor = tables.neighbors[4 * tet + corner]
         moved = jnp.where(neighbor >= 0, _UNSETTLED - neighbor, state)
+        # Twice: no vertex is beyond half a tolerance, so the point is farther than one from every tet.
+        moved = jnp.where((neighbor == _HULL) & (depth < -2 * tables.tolerance), -1, moved)
         moved = jnp.where(depth >= tables.tolerance, tet, moved)
         return jnp.where(state <= _UNSETTLED, moved, state)
 
