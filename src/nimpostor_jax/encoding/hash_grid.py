@@ -70,7 +70,7 @@ def _encode(
 ) -> Float[Array, "M L*F"]:
     """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best.
 
-    All chunks of a level come before the next level, whose entries then are in the cache once and not per chunk.
+    All chunks of a level come before the next level: its entries come into the cache once, not per chunk.
     """
     points = _points(config, chunk, layout, tet_ids, lambdas, num_used)
 
@@ -80,7 +80,7 @@ def _encode(
             weights, nodes = corners(part.coordinates)
             rows = (_rows(features, address(part, node)) for node in nodes)
             total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
-            return jax.lax.dynamic_update_slice(out, total[None], (level, start, jnp.int32(0)))
+            return jax.lax.dynamic_update_slice(out, jnp.expand_dims(total, 0), (level, start, jnp.int32(0)))
 
         return for_chunks(num_used, chunk, encode_chunk, out)
 
@@ -112,7 +112,7 @@ def _encode_backward(
             d_features, d_coordinates = sums
             part = take(points, start, chunk)
             weights, pull, nodes = jax.vjp(corners, part.coordinates, has_aux=True)
-            d_level = jax.lax.dynamic_slice(d_levels, (level, start, jnp.int32(0)), (1, chunk, features.shape[1]))[0]
+            d_level = take(jax.lax.dynamic_index_in_dim(d_levels, level, keepdims=False), start, chunk)
             d_weights = []
             for weight, node in zip(weights, nodes, strict=True):
                 entries = address(part, node)
@@ -218,7 +218,8 @@ def _for_levels(config: EncodingConfig, layout: HashLayout, add_level: Callable[
             level, partial(corners, resolution), partial(address, layout, level, resolution), carry
         )
 
-    carry = jax.lax.fori_loop(0, num_dense, partial(body, dense=True), carry)
+    if num_dense:  # a loop over none is traced too, and would read from empty ranks
+        carry = jax.lax.fori_loop(0, num_dense, partial(body, dense=True), carry)
     return jax.lax.fori_loop(num_dense, config.num_levels, partial(body, dense=False), carry)
 
 
