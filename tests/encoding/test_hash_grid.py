@@ -218,6 +218,32 @@ def test_gradients_are_finite_on_corners_edges_and_faces(interpolation):
     assert np.all(np.isfinite(gradient))
 
 
+def test_all_levels_may_be_hashed(x64, rng):
+    config = EncodingConfig(num_levels=2, base_resolution=20, log2_tet_table=4)
+    _, tets = MESHES["delaunay"]()
+    layout = build_layout(tets, config)
+    assert len(layout.dense_ranks) == 0
+    features = jnp.asarray(rng.normal(size=(int(layout.starts[-1]), 2)))
+    ids, lambdas = random_points(tets, rng, 4)
+    values = encode_jit(HashTables(features, layout), config, jnp.asarray(ids), jnp.asarray(lambdas))
+    for value, tet, coordinates in zip(values, ids, lambdas, strict=True):
+        assert_allclose(value, oracles.encode(features, layout, config, tet, coordinates), atol=1e-12)
+
+
+def test_gradients_asked_for_alone_are_those_of_both(rng):
+    config, tets, tables = tables_of("per_simplex", "simplex", dtype="float32")
+    ids, lambdas = map(jnp.asarray, random_points(tets, rng, COUNT))
+
+    def total(features, lambdas):
+        values = encode(tables.replace(features=features), config, ids, lambdas.astype(jnp.float32))
+        return jnp.sum(values**2)
+
+    by_both = jax.jit(jax.grad(total, argnums=(0, 1)))(tables.features, lambdas)
+    for argument, expected in enumerate(by_both):
+        alone = jax.jit(jax.grad(total, argnums=argument))(tables.features, lambdas)
+        assert_allclose(alone, expected, rtol=1e-5, atol=1e-5)  # sums in another order
+
+
 def test_coordinates_out_of_range_by_rounding_are_clipped(rng):
     config, _, tables = tables_of("per_simplex", "grid", dtype="float32")
     inside = jnp.array([[0.0, 0.5, 0.5, 0.0]], jnp.float32)

@@ -18,19 +18,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import struct
-from jax.custom_derivatives import custom_vjp_primal_tree_values
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int, UInt
 
-from nimpostor_jax.chunks import (
-    default_chunk,
-    for_chunks,
-    join_moving,
-    materialize,
-    pad_items,
-    put,
-    split_moving,
-    take,
-)
+from nimpostor_jax.chunks import default_chunk, for_chunks, pad_items, put, take
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.layout import SIZE_BITS
 from nimpostor_jax.types import HashLayout, HashTables
@@ -39,7 +30,7 @@ Coordinates = tuple[Float[Array, " M"], ...]
 Nodes = list[Int[Array, " M"]]
 Corners = tuple[list[Float[Array, " M"]], list[Nodes]]
 _CornersOf = Callable[[Coordinates], Corners]
-_AddressOf = Callable[[Nodes], Int[Array, " M"]]
+_AddressOf = Callable[[Any, Nodes], Int[Array, " M"]]
 
 
 def init_features(key: Array, num_entries: int, config: EncodingConfig) -> Float[Array, "entries F"]:
@@ -81,73 +72,81 @@ def _encode(
     num_used: Int[Array, ""],
     known: Float[Array, "M L*F"] | None,
 ) -> Float[Array, "M L*F"]:
-    """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best."""
+    """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best.
+
+    All chunks of a level come before the next level: its entries come into the cache once, not per chunk.
+    """
     if known is not None:
         return known
+    points = _points(config, chunk, layout, tet_ids, lambdas, num_used)
 
-    def encode_chunk(start: Array, out: Array) -> Array:
-        points = _points(layout, take(tet_ids, start, chunk))
-        coordinates = _canonical(layout, config, points.tet_ids, take(lambdas, start, chunk))
-
-        def add_level(level: Array, corners: _CornersOf, address: _AddressOf, part: Array) -> Array:
-            weights, nodes = corners(coordinates)
-            rows = (_rows(features, address(node)) for node in nodes)
+    def add_level(level: Array, corners: _CornersOf, address: _AddressOf, out: Array) -> Array:
+        def encode_chunk(start: Array, out: Array) -> Array:
+            part = take(points, start, chunk)
+            weights, nodes = corners(part.coordinates)
+            rows = (_rows(features, address(part, node)) for node in nodes)
             total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
-            return jax.lax.dynamic_update_index_in_dim(part, total, level, 1)
+            return jax.lax.dynamic_update_slice(out, jnp.expand_dims(total, 0), (level, start, jnp.int32(0)))
 
-        part = jnp.zeros((chunk, config.num_levels, features.shape[1]), features.dtype)
-        part = _for_levels(config, layout, points, add_level, part)
-        return put(out, start, part.reshape(chunk, -1))
+        return for_chunks(num_used, chunk, encode_chunk, out)
 
-    shape = (tet_ids.shape[0], config.num_levels * features.shape[1])
-    return for_chunks(num_used, chunk, encode_chunk, jnp.zeros(shape, features.dtype))
+    num_points, num_features = tet_ids.shape[0], features.shape[1]
+    out = jnp.zeros((config.num_levels, num_points, num_features), features.dtype)
+    out = _for_levels(config, layout, add_level, out)
+    return out.transpose(1, 0, 2).reshape(num_points, -1)
 
 
-def _encode_forward(config: EncodingConfig, chunk: int, *arguments: Any) -> tuple[Array, tuple]:
-    values = custom_vjp_primal_tree_values(arguments)
-    moving, fixed = split_moving((arguments[0], arguments[3]))  # tables and coordinates
-    return _encode(config, chunk, *values), (moving, fixed, values[1], values[2], values[4])
+def _encode_forward(config: EncodingConfig, chunk: int, *primals: Any) -> tuple[Array, tuple]:
+    """Keeps which gradients are asked for, as () or None: static, since an empty tuple holds no array."""
+    arguments = jax.tree.map(lambda p: p.value, primals)
+    wanted = tuple(() if primals[i].perturbed else None for i in (0, 3))
+    return _encode(config, chunk, *arguments), (arguments, wanted)
 
 
 def _encode_backward(
-    config: EncodingConfig, chunk: int, residuals: tuple, cotangent: Float[Array, "M L*F"]
+    config: EncodingConfig, chunk: int, residuals: tuple, cotangent: Float[Array, "M L*F"] | SymbolicZero
 ) -> tuple:
-    moving, fixed, layout, tet_ids, num_used = residuals
-    features, lambdas = join_moving(moving, fixed)
-    cotangent = materialize(cotangent)
+    """Scatters into the tables, and gathers for the coordinates, only where that gradient is used."""
+    (features, layout, tet_ids, lambdas, num_used, _), (of_features, of_lambdas) = residuals
+    if isinstance(cotangent, SymbolicZero):
+        return (None,) * 6
+    points = _points(config, chunk, layout, tet_ids, lambdas, num_used)
+    d_levels = cotangent.reshape(len(tet_ids), config.num_levels, -1).transpose(1, 0, 2)
 
-    def encode_chunk(start: Array, sums: tuple) -> tuple:
-        d_features, d_lambdas = sums
-        points = _points(layout, take(tet_ids, start, chunk))
-        canonical = partial(_canonical, layout, config, points.tet_ids)
-        coordinates, pull_coordinates = jax.vjp(canonical, take(lambdas, start, chunk))
-        d_part = take(cotangent, start, chunk).reshape(chunk, config.num_levels, -1)
-
-        def add_level(level: Array, corners: _CornersOf, address: _AddressOf, sums: tuple) -> tuple:
+    def add_level(level: Array, corners: _CornersOf, address: _AddressOf, sums: tuple) -> tuple:
+        def encode_chunk(start: Array, sums: tuple) -> tuple:
             d_features, d_coordinates = sums
-            weights, pull, nodes = jax.vjp(corners, coordinates, has_aux=True)
-            d_level = jax.lax.dynamic_index_in_dim(d_part, level, 1, keepdims=False)
+            part = take(points, start, chunk)
+            weights, pull, nodes = jax.vjp(corners, part.coordinates, has_aux=True)
+            d_level = take(jax.lax.dynamic_index_in_dim(d_levels, level, keepdims=False), start, chunk)
             d_weights = []
             for weight, node in zip(weights, nodes, strict=True):
-                entries = address(node)
-                if d_coordinates is not None:
-                    products = _rows(features, entries) * d_level
-                    d_weights.append(jnp.sum(products, axis=-1).astype(weight.dtype))
-                if d_features is not None:
+                entries = address(part, node)
+                if of_lambdas is not None:
+                    d_weight = jnp.sum(_rows(features, entries) * d_level, axis=-1)
+                    d_weights.append(d_weight.astype(weight.dtype))
+                if of_features is not None:
                     d_rows = weight[:, None] * d_level
                     d_features = d_features.at[entries].add(d_rows, mode="promise_in_bounds")
-            if d_coordinates is not None:
-                d_coordinates = jax.tree.map(jnp.add, d_coordinates, *pull(d_weights))
+            if of_lambdas is not None:
+                added = jax.tree.map(jnp.add, take(d_coordinates, start, chunk), *pull(d_weights))
+                d_coordinates = put(d_coordinates, start, added)
             return d_features, d_coordinates
 
-        zeros = None if d_lambdas is None else jax.tree.map(jnp.zeros_like, coordinates)
-        d_features, d_coordinates = _for_levels(config, layout, points, add_level, (d_features, zeros))
-        if d_lambdas is not None:
-            d_lambdas = put(d_lambdas, start, *pull_coordinates(d_coordinates))
-        return d_features, d_lambdas
+        return for_chunks(num_used, chunk, encode_chunk, sums)
 
-    zeros = jax.tree.map(jnp.zeros_like, moving)
-    d_features, d_lambdas = for_chunks(num_used, chunk, encode_chunk, zeros)
+    d_features = None if of_features is None else jnp.zeros_like(features)
+    d_coordinates = None if of_lambdas is None else jax.tree.map(jnp.zeros_like, points.coordinates)
+    d_features, d_coordinates = _for_levels(config, layout, add_level, (d_features, d_coordinates))
+    if of_lambdas is None:
+        return d_features, None, None, None, None, None
+
+    def pull_chunk(start: Array, d_lambdas: Array) -> Array:
+        canonical = partial(_canonical, layout, config, take(tet_ids, start, chunk))
+        _, pull = jax.vjp(canonical, take(lambdas, start, chunk))
+        return put(d_lambdas, start, *pull(take(d_coordinates, start, chunk)))
+
+    d_lambdas = for_chunks(num_used, chunk, pull_chunk, jnp.zeros_like(lambdas))
     return d_features, None, None, d_lambdas, None, None
 
 
@@ -156,14 +155,34 @@ _encode.defvjp(_encode_forward, _encode_backward, symbolic_zeros=True)
 
 @struct.dataclass
 class _Points:
-    """What addresses need of a chunk's points at every level."""
+    """What every level needs of the points."""
 
     tet_ids: Int[Array, " M"]
+    coordinates: Coordinates
     multipliers: tuple[UInt[Array, " M"], ...]  # of the tet's four corners
 
 
-def _points(layout: HashLayout, tet_ids: Int[Array, " M"]) -> _Points:
-    return _Points(tet_ids=tet_ids, multipliers=tuple(layout.multipliers[:, i][tet_ids] for i in range(4)))
+def _points(
+    config: EncodingConfig,
+    chunk: int,
+    layout: HashLayout,
+    tet_ids: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
+    num_used: Int[Array, ""],
+) -> _Points:
+    def prepare_chunk(start: Array, points: _Points) -> _Points:
+        tets = take(tet_ids, start, chunk)
+        coordinates = _canonical(layout, config, tets, take(lambdas, start, chunk))
+        multipliers = tuple(layout.multipliers[:, i][tets] for i in range(4))
+        return put(points, start, _Points(tet_ids=tets, coordinates=coordinates, multipliers=multipliers))
+
+    num_points = tet_ids.shape[0]
+    empty = _Points(
+        tet_ids=tet_ids,
+        coordinates=tuple(jnp.zeros(num_points, lambdas.dtype) for _ in range(4)),
+        multipliers=tuple(jnp.zeros(num_points, layout.multipliers.dtype) for _ in range(4)),
+    )
+    return for_chunks(num_used, chunk, prepare_chunk, empty)
 
 
 def _canonical(
@@ -191,22 +210,22 @@ def _rows(features: Float[Array, "entries F"], entries: Int[Array, " M"]) -> Flo
     return features.at[entries].get(mode="promise_in_bounds")
 
 
-def _for_levels(
-    config: EncodingConfig, layout: HashLayout, points: _Points, add_level: Callable, carry: Any
-) -> Any:
+def _for_levels(config: EncodingConfig, layout: HashLayout, add_level: Callable[..., Any], carry: Any) -> Any:
     """Fold `add_level` over the levels: first the densely stored, then the hashed ones."""
     corners = _grid_corners if config.interpolation == "grid" else _simplex_corners
     resolutions = jnp.asarray(config.resolutions, jnp.int32)
     num_dense = layout.rank_starts.shape[0] - 1
 
     def body(level: Array, carry: Any, dense: bool) -> Any:
+        level = level.astype(jnp.int32)  # as the chunks' starts: in x64 the loop counts in 64 bits
         resolution = resolutions[level]
         address = _dense_address if dense else _hashed_address
         return add_level(
-            level, partial(corners, resolution), partial(address, layout, points, level, resolution), carry
+            level, partial(corners, resolution), partial(address, layout, level, resolution), carry
         )
 
-    carry = jax.lax.fori_loop(0, num_dense, partial(body, dense=True), carry)
+    if num_dense:  # a loop over none is traced too, and would read from empty ranks
+        carry = jax.lax.fori_loop(0, num_dense, partial(body, dense=True), carry)
     return jax.lax.fori_loop(num_dense, config.num_levels, partial(body, dense=False), carry)
 
 
@@ -262,7 +281,7 @@ def _cell(scaled: Float[Array, " M"], resolution: Int[Array, ""]) -> Float[Array
 
 
 def _dense_address(
-    layout: HashLayout, points: _Points, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
+    layout: HashLayout, level: Int[Array, ""], resolution: Int[Array, ""], points: _Points, node: Nodes
 ) -> Int[Array, " M"]:
     """Table entries of nodes (four integer coordinates) at a densely stored level."""
     stride = resolution + 1
@@ -272,7 +291,7 @@ def _dense_address(
 
 
 def _hashed_address(
-    layout: HashLayout, points: _Points, level: Int[Array, ""], resolution: Int[Array, ""], node: Nodes
+    layout: HashLayout, level: Int[Array, ""], resolution: Int[Array, ""], points: _Points, node: Nodes
 ) -> Int[Array, " M"]:
     """Table entries of nodes at a hashed level."""
     region = _region(layout, points, level, node)

@@ -1,15 +1,18 @@
 """The query Q of Eq. 2: which tet holds a point, and the point's barycentric coordinates there.
 
-A coarse grid over the cage names a tet near each point, or that there is none; from there a short
-walk crosses the face that the point lies farthest behind. Points that the walk does not settle (it
-left a cage that is not convex, ran in a circle, or ended within rounding of a face) are gathered
-and descend the binary tree over tets, which finds every candidate. All tables follow from the
-current vertices in a few reductions and scatters.
+A coarse grid over the cage names a tet near each point, or that there is none; from there a walk
+crosses the face that the point lies farthest behind. It ends in the point's tet, or beyond a face
+of the cage's convex hull. A few steps settle most points; the others are gathered and walk on.
+What even this does not settle (it left a cage that is not convex, ran in a circle, or ended within
+rounding of a face) descends the binary tree over tets, which finds every candidate. All tables
+follow from the current vertices in a few reductions and scatters.
 
 Axes: N points, T tets. Containment is decided by distances to the faces' planes: their rounding
 errors are of one size everywhere, whatever the tet's shape, and two tets see their common face in
 the same plane bit for bit.
 """
+
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -26,8 +29,10 @@ TOLERANCE = 8  # units in the last place of the cage's extent: how far outside a
 CELLS_PER_TET = 8
 MAX_RESOLUTION = 96  # cells a side
 FLOOD_ROUNDS = 4
-WALK_STEPS = 5  # measured: 1 on average; the few points that need more are cheaper in the tree
-CPU_TREE_TILE = 1024  # points that descend the tree together
+WALK_STEPS = 4  # of all points: the few that need more are cheaper gathered
+LONG_WALK_STEPS = 40  # of gathered points; then they run in a circle
+CPU_TILE = 512  # gathered points that walk on or descend the tree together
+HULL_TESTS = 1 << 25  # boundary faces times vertices: for larger meshes the test costs more than the tree
 _UNSETTLED = -2  # the walk holds -2 - tet while it goes on, the tet when settled, -1 outside
 
 
@@ -37,6 +42,7 @@ class LocateTables:
 
     planes: Float[Array, " 16T"]  # at 16 tet + 4 corner: the face opposite, inward normal and offset
     neighbors: Int[Array, " 4T"]
+    hull_faces: Int[Array, " T"]  # bit i: nothing of the mesh lies beyond the face opposite corner i
     seeds: Int[Array, " cells"]  # a tet near the cell's centre; -1 where no tet can reach the cell
     low: Float[Array, " 3"]  # box of the cage
     high: Float[Array, " 3"]
@@ -62,9 +68,11 @@ def locate_tables(mesh: TetMesh) -> LocateTables:
         jnp.where(used, low[leaf_tets], jnp.inf), jnp.where(used, high[leaf_tets], -jnp.inf)
     )
     box_low, box_high = jnp.min(low, axis=0), jnp.max(high, axis=0)
+    planes = _planes(vertices, mesh.tets)
     return LocateTables(
-        planes=_planes(vertices, mesh.tets).reshape(-1),
+        planes=planes.reshape(-1),
         neighbors=mesh.neighbors.reshape(-1),
+        hull_faces=_hull_faces(mesh, vertices, planes, tolerance),
         seeds=_seeds(positions, low - tolerance, high + tolerance, box_low, box_high),
         low=box_low,
         high=box_high,
@@ -97,6 +105,24 @@ def _planes(vertices: Float[Array, "V 3"], tets: Int[Array, "T 4"]) -> Float[Arr
     normal = -outward * normal / jnp.sqrt(jnp.where(valid, squared, 1))
     offset = -jnp.sum(normal * first, axis=-1, keepdims=True)
     return jnp.concatenate([normal, jnp.where(valid, offset, -jnp.inf)], axis=-1)
+
+
+def _hull_faces(
+    mesh: TetMesh, vertices: Float[Array, "V 3"], planes: Float[Array, "T 4 4"], tolerance: Float[Array, ""]
+) -> Int[Array, " T"]:
+    """For each tet the boundary faces, as bits, whose planes have all vertices on one side.
+
+    A point beyond such a face is outside, convex mesh or not, and need not descend the tree.
+    """
+    tets, local = mesh.boundary.tets.reshape(-1), mesh.boundary.corners.reshape(-1)
+    none = jnp.zeros(len(mesh.tets), jnp.int32)
+    if tets.shape[0] * vertices.shape[0] > HULL_TESTS:
+        return none
+    plane = planes[jnp.maximum(tets, 0), jnp.maximum(local, 0)][:, :, None]  # [faces, 4, 1]
+    x, y, z = (vertices[:, i] for i in range(3))
+    lowest = jnp.min(plane[:, 0] * x + plane[:, 1] * y + plane[:, 2] * z + plane[:, 3], axis=1)
+    on_hull = (tets >= 0) & (lowest >= -tolerance / 2)
+    return none.at[jnp.where(on_hull, tets, len(none))].add(1 << local, mode="drop")
 
 
 def _seeds(
@@ -155,49 +181,72 @@ def find_tets(tables: LocateTables, points: Float[Array, "N 3"]) -> Int[Array, "
         return jnp.zeros(0, jnp.int32)
     points = jax.lax.stop_gradient(points)
     columns = tuple(points[:, i] for i in range(3))
-    return _descend(tables, columns, _walk(tables, points, columns))
+    state = _start(tables, points)
+    state = jax.lax.fori_loop(0, WALK_STEPS, lambda _, state: _step(tables, columns, state), state)
+    return _settle(tables, columns, _settle(tables, columns, state, _walk_on), _search_tree)
 
 
-def _walk(tables: LocateTables, points: Float[Array, "N 3"], columns: tuple) -> Int[Array, " N"]:
+def _start(tables: LocateTables, points: Float[Array, "N 3"]) -> Int[Array, " N"]:
+    """The walk's state at the seeds."""
     low, high = tables.low - tables.tolerance, tables.high + tables.tolerance
     near = jnp.all((points >= low) & (points <= high), axis=1)
     side = round(tables.seeds.shape[0] ** (1 / 3))
     cells = _cells(points, tables.low, tables.high, side)
     seeds = tables.seeds[(cells[:, 0] * side + cells[:, 1]) * side + cells[:, 2]]
 
-    def step(_: Int[Array, ""], state: Int[Array, " N"]) -> Int[Array, " N"]:
-        # One array of state: a second one would compute the distances twice.
-        tet = jnp.maximum(_UNSETTLED - state, 0)
-        depth, corner = _depth(tables, columns, tet)
-        neighbor = tables.neighbors[4 * tet + corner]
-        moved = jnp.where(neighbor >= 0, _UNSETTLED - neighbor, state)
-        moved = jnp.where(depth >= tables.tolerance, tet, moved)
-        return jnp.where(state <= _UNSETTLED, moved, state)
-
-    start = jnp.where(near & (seeds >= 0), _UNSETTLED - seeds, -1)
-    return jax.lax.fori_loop(0, WALK_STEPS, step, start)
+    return jnp.where(near & (seeds >= 0), _UNSETTLED - seeds, -1)
 
 
-def _depth(
-    tables: LocateTables, columns: tuple, tets: Int[Array, " N"]
-) -> tuple[Float[Array, " N"], Int[Array, " N"]]:
-    """Distance to the tet's nearest face plane, negative outside, and the corner opposite to it."""
-    depth, nearest = jnp.asarray(jnp.inf, tables.planes.dtype), jnp.asarray(0, jnp.int32)
+def _step(tables: LocateTables, columns: tuple, state: Int[Array, " N"]) -> Int[Array, " N"]:
+    """Across the face that the point lies farthest behind.
+
+    One array of state: XLA would compute the distances again for a second one.
+    """
+    tet = jnp.maximum(_UNSETTLED - state, 0)
+    distances = _distances(tables, columns, tet)
+    depth, nearest = distances[0], jnp.asarray(0, jnp.int32)
+    for corner in range(1, 4):
+        nearest = jnp.where(distances[corner] < depth, corner, nearest)
+        depth = jnp.minimum(distances[corner], depth)
+    # Twice: vertices are beyond by half a tolerance at most, so the point is by more than one.
+    behind = sum((d < -2 * tables.tolerance).astype(jnp.int32) << i for i, d in enumerate(distances))
+    neighbor = tables.neighbors[4 * tet + nearest]
+    moved = jnp.where(neighbor >= 0, _UNSETTLED - neighbor, state)
+    moved = jnp.where((behind & tables.hull_faces[tet]) != 0, -1, moved)
+    moved = jnp.where(depth >= tables.tolerance, tet, moved)
+    return jnp.where(state <= _UNSETTLED, moved, state)
+
+
+def _walk_on(tables: LocateTables, columns: tuple, state: Int[Array, " lanes"]) -> Int[Array, " lanes"]:
+    """More steps, as long as they lead anywhere."""
+
+    def step(carry: tuple) -> tuple:
+        count, state, _ = carry
+        moved = _step(tables, columns, state)
+        return count + 1, moved, jnp.any(moved != state)
+
+    start = (jnp.zeros((), jnp.int32), state, jnp.asarray(True))
+    return jax.lax.while_loop(lambda carry: (carry[0] < LONG_WALK_STEPS) & carry[2], step, start)[1]
+
+
+def _distances(tables: LocateTables, columns: tuple, tets: Int[Array, " N"]) -> list[Float[Array, " N"]]:
+    """Distances to the planes of the tet's four faces, negative outside."""
     x, y, z = columns
+    distances = []
     for corner in range(4):
         plane = [tables.planes[16 * tets + (4 * corner + i)] for i in range(4)]
-        distance = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
-        nearest = jnp.where(distance < depth, corner, nearest)
-        depth = jnp.minimum(distance, depth)
-    return depth, nearest
+        distances.append(plane[0] * x + plane[1] * y + plane[2] * z + plane[3])
+    return distances
 
 
-def _descend(tables: LocateTables, columns: tuple, walked: Int[Array, " N"]) -> Int[Array, " N"]:
-    """Settle by the tree what the walk did not, `CPU_TREE_TILE` gathered points at a time."""
+def _settle(
+    tables: LocateTables, columns: tuple, walked: Int[Array, " N"], method: Callable[..., Array]
+) -> Int[Array, " N"]:
+    """The state after `method` on the points not settled yet, `CPU_TILE` gathered ones at a time."""
     unsettled = walked <= _UNSETTLED
     num_points = walked.shape[0]
     on_cpu = jax.default_backend() == "cpu"
-    tile = min(num_points, CPU_TREE_TILE) if on_cpu else num_points
+    tile = min(num_points, CPU_TILE) if on_cpu else num_points
     ranks = jnp.cumsum(unsettled, dtype=jnp.int32) - 1
     queue = jnp.full(num_points + tile, num_points, jnp.int32)  # past its end: points that are none
     queue = queue.at[jnp.where(unsettled, ranks, num_points + tile)].set(
@@ -208,14 +257,14 @@ def _descend(tables: LocateTables, columns: tuple, walked: Int[Array, " N"]) -> 
         start, settled = state
         chosen = jax.lax.dynamic_slice(queue, (start,), (tile,))
         held = jnp.minimum(chosen, num_points - 1)
-        found = _search_tree(tables, tuple(column[held] for column in columns))
+        found = method(tables, tuple(column[held] for column in columns), settled[held])
         return start + tile, settled.at[chosen].set(found, mode="drop")
 
     start = (jnp.zeros((), jnp.int32), walked)
     return jax.lax.while_loop(lambda state: state[0] <= ranks[-1], body, start)[1]
 
 
-def _search_tree(tables: LocateTables, columns: tuple) -> Int[Array, " lanes"]:
+def _search_tree(tables: LocateTables, columns: tuple, _: Int[Array, " lanes"]) -> Int[Array, " lanes"]:
     """Of the tets that hold a point up to the tolerance, that in which it lies deepest; else -1."""
     num_leaves = tables.leaf_tets.shape[0]
     boxes = [(tables.node_low[:, i], tables.node_high[:, i]) for i in range(3)]
@@ -228,7 +277,8 @@ def _search_tree(tables: LocateTables, columns: tuple) -> Int[Array, " lanes"]:
             hit &= (low[node] <= x) & (x <= high[node])
         leaf = node - num_leaves
         tet = tables.leaf_tets[jnp.maximum(leaf, 0)]
-        depth, _ = _depth(tables, columns, jnp.maximum(tet, 0))
+        distances = _distances(tables, columns, jnp.maximum(tet, 0))
+        depth = jnp.minimum(jnp.minimum(*distances[:2]), jnp.minimum(*distances[2:]))
         better = (depth > best) | ((depth == best) & (tet < found))
         better &= hit & (leaf >= 0) & (tet >= 0)
         best, found = jnp.where(better, depth, best), jnp.where(better, tet, found)
