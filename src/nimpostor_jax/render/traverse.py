@@ -278,6 +278,7 @@ def _find_entries(
         # Counter-clockwise from outside is clockwise along a ray that comes from outside.
         left, close = _sides(((a, b), (b, c), (c, a)), careful)
         hit, possible = (hold >= 0) & ~left[0] & ~left[1] & ~left[2], hold >= 0
+        hit &= (a[0] != b[0]) | (a[1] != b[1])  # seen as a point, a face has no left and right
         for passed, doubt in zip(left, close, strict=True):
             possible &= ~passed | doubt
         met, flat = _met(a, b, c, careful)
