@@ -29,7 +29,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from stress_meshes import FROM_ORIGIN, MESHES, RAYS, ROOM, Case, build, unit
+from stress_meshes import FROM_ORIGIN, MESHES, RAYS, Case, build, unit
 from stress_oracle import (
     Geometry,
     Lines,
@@ -135,7 +135,7 @@ def stress(case: Case, dtype: str, rounds: int, seed: Any) -> Row:
         row["nonfinite"] += count_nonfinite(segments)
         few = np.arange(min(COLORED, len(error)))
         sigma = DENSITIES[turn % len(DENSITIES)]
-        some_rays, some_segments = jax.tree.map(lambda x: x[few], (rays, segments))
+        some_rays, some_segments = jax.tree.map(lambda x, few=few: x[few], (rays, segments))
         some_crossings = crossings.replace(
             codes=crossings.codes[few], ends=crossings.ends[:, few], overflow=crossings.overflow[few]
         )
@@ -261,7 +261,7 @@ def chord_errors(
 
 
 def nudged(lines: Lines) -> Lines:
-    """Lines aside of faces and edges, by less than rounding may move them: each tet holds them or does not."""
+    """Lines aside of faces and edges, by less than rounding may move them: a tet holds them or not."""
     aside = jnp.cross(lines.directions, jnp.array([0.36, 0.48, 0.8]))
     return lines.replace(origins=lines.origins + lines.margin[:, None] / 4 * aside)
 

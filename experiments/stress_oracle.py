@@ -183,7 +183,10 @@ def _long_intervals(
 ) -> tuple[np.ndarray, np.ndarray]:
     """`tet_intervals` of pairs of a ray and a tet, in long double: a sliver's tip costs six digits."""
     origins, directions = (np.asarray(x, np.longdouble)[rays] for x in (lines.origins, lines.directions))
-    low, high = np.full(len(rays), float(lines.near), np.longdouble), np.full(len(rays), np.inf, np.longdouble)
+    low, high = (
+        np.full(len(rays), float(lines.near), np.longdouble),
+        np.full(len(rays), np.inf, np.longdouble),
+    )
     for face in range(4):
         plane = solid.long_planes[tets, face]
         height = np.sum(origins * plane[:, :3], axis=1) + plane[:, 3] + around
@@ -199,7 +202,7 @@ def _long_intervals(
 def pieces(solid: Solid, lines: Lines) -> Pieces:
     """Cut lines by sweeping along t; of meshes without inverted tets."""
     candidates, faces = _candidates(solid.geometry, lines)
-    num_rays, num_tets = candidates.shape
+    num_rays = len(candidates)
     pairs = np.nonzero(np.asarray(candidates))
     near = np.asarray(faces[0]) < np.asarray(faces[1])  # false for NaN
     near_ends = (np.asarray(x)[near] for x in faces)
