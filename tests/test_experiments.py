@@ -1,5 +1,6 @@
-"""What the measuring scripts compute by themselves: the stress test's oracle, the Pareto front, peers."""
+"""What the measuring scripts compute by themselves: the stress test's oracle, fits, fronts, peers."""
 
+import importlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -7,65 +8,103 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rays import as_rays
 
 from nimpostor_jax.config import MarchConfig
-from nimpostor_jax.preprocess.topology import build_tet_mesh
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
 
 
-def script(name):
-    spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+@pytest.fixture(autouse=True)
+def beside_each_other(monkeypatch):
+    """Scripts import their neighbours, as they do when they are run."""
+    monkeypatch.syspath_prepend(str(EXPERIMENTS))
 
 
 @pytest.fixture
 def marched(x64, rng):
     """The stress script, and rays that it finds in order on a small grid."""
-    stress = script("stress")
-    mesh = build_tet_mesh(*stress.kuhn_grid(2), dtype="float32")
-    vertices, tets = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.tets)
-    planes = stress.tet_planes(vertices, tets)
-    rays = as_rays(stress.RAYS["random"](vertices, tets, rng, 64))
-    segments = stress.march_rays(mesh, rays, MarchConfig(max_tets_per_ray=32, max_entries_per_ray=4))
-    return stress, planes, rays, segments
+    stress, meshes = (importlib.import_module(name) for name in ("stress", "stress_meshes"))
+    case = meshes.Case(meshes.kuhn_grid(2, 2, 2), chunk=64)
+    mesh = meshes.build(case, "float32")
+    rays, lines = stress.draw_rays(case, mesh, "random", rng)
+    march = MarchConfig(max_tets_per_ray=32, max_entries_per_ray=4)
+    _, segments, _ = stress.march_rays(mesh, rays, jnp.float32(stress.BEHIND), march)
+    return stress, stress.solid_of(mesh), lines, segments, mesh
+
+
+def errors_of(stress, solid, lines, segments):
+    return stress.chord_errors(solid, lines, np.array(stress.lengths(segments)), 1e-4)
 
 
 def test_the_oracle_agrees_with_the_march(marched):
-    stress, planes, rays, segments = marched
-    assert np.abs(stress.chord_errors(planes, rays, segments, 1e-4)).max() < 1e-4
+    stress, solid, lines, segments, mesh = marched
+    assert np.abs(errors_of(stress, solid, lines, segments)).max() < 1e-4
     assert not np.any(stress.overlapping(segments, 1e-4))
     assert stress.count_nonfinite(segments) == 0
+    errors = stress.color_errors(mesh, solid, segments, lines, 1e-4)
+    assert len(errors) > 40
+    assert errors.max() < 1e-4
 
 
 def test_a_lost_a_doubled_and_a_broken_segment_are_noticed(marched):
-    stress, planes, rays, segments = marched
+    stress, solid, lines, segments, mesh = marched
     length = np.asarray(segments.t_exit - segments.t_enter)
     ray, slot = np.unravel_index(np.argmax(length), length.shape)
     lost = segments.replace(t_exit=segments.t_exit.at[ray, slot].set(segments.t_enter[ray, slot]))
-    assert stress.chord_errors(planes, rays, lost, 1e-4)[ray] == pytest.approx(-length[ray, slot], abs=1e-3)
-    earlier = segments.t_enter.at[ray, slot].add(-0.1) if slot else segments.t_enter
-    longer = segments.replace(t_enter=earlier, t_exit=segments.t_exit.at[ray, slot].add(0.1))
-    assert stress.chord_errors(planes, rays, longer, 1e-4)[ray] > 0.09
-    assert stress.overlapping(longer, 1e-4)[ray]
+    assert errors_of(stress, solid, lines, lost)[ray] == pytest.approx(-length[ray, slot], abs=1e-3)
+    assert stress.color_errors(mesh, solid, lost, lines, 1e-4).max() > 0.01
+    longer = segments.replace(t_exit=segments.t_exit.at[ray, slot].add(0.1))
+    assert errors_of(stress, solid, lines, longer)[ray] > 0.09
+    twice = jnp.concatenate([segments.t_enter, segments.t_enter], axis=1)
+    twice_exit = jnp.concatenate([segments.t_exit, segments.t_exit], axis=1)
+    assert stress.overlapping(segments.replace(t_enter=twice, t_exit=twice_exit), 1e-4)[ray]
     broken = segments.replace(t_enter=segments.t_enter.at[0, 0].set(jnp.nan))
     assert stress.count_nonfinite(broken) == 1
 
 
 def test_a_ray_in_a_boundary_face_may_count_as_inside_or_outside(marched):
-    stress, planes, _, _ = marched
-    top = float(np.abs(np.asarray(planes)[:, :, 3]).max())
-    origin, direction = np.array([[0.1, -3.0, top]]), np.array([[0.0, 1.0, 0.0]])
-    low, high = stress.chord_range(planes, origin, direction, "float32")
+    stress, solid, lines, _, mesh = marched
+    top = float(jnp.max(mesh.vertices))
+    face = stress.take(lines, np.zeros(1, int)).replace(
+        origins=jnp.array([[0.1, -3.0, top]]), directions=jnp.array([[0.0, 1.0, 0.0]])
+    )
+    low, high = stress.chord_range(stress.pieces(solid, face))
     assert low == 0
     assert high == pytest.approx(2 * top, abs=1e-3)
 
 
+@pytest.mark.parametrize("name", ["pancake", "foil", "slivers", "huge", "far_away", "scrambled", "collapsed"])
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_a_little_stress(name, dtype, x64, rng):
+    """Every kind of ray through every awkward mesh; all are padded to one size and compile once."""
+    stress, meshes = (importlib.import_module(name) for name in ("stress", "stress_meshes"))
+    case = meshes.MESHES[name](np.random.default_rng(0))._replace(chunk=128)
+    row = stress.stress(case, dtype, 1, 0)
+    assert row["rays"] == 128 * len(meshes.RAYS)
+    assert row["lost"] == row["doubled"] == row["nonfinite"] == row["overflow"] == 0
+    assert row["max_chord_error"] <= stress.TOLERANCE[dtype]
+    assert row["color_error"] <= stress.TOLERANCE[dtype]
+
+
+def test_exponents_are_slopes_of_logarithms():
+    scaling = importlib.import_module("scaling")
+    rows = [{"sweep": "cage", "tets": n, "ns_per_ray": 5 * n**0.3, "peak_memory_gib": 1.0, "build_s": n}
+            for n in (6, 300, 3000, 30000)]  # fmt: skip
+    fits = scaling.exponents([{"pixels": 1, **row} for row in rows])
+    assert fits["cage: ns_per_ray by tets"] == pytest.approx(0.3)
+    assert fits["cage: build_s by tets"] == pytest.approx(1)
+    assert np.isnan(fits["image: ms by pixels"])
+
+
+def test_scaling_measures_a_small_cage():
+    row = importlib.import_module("scaling").time_march("cage", 2, 32, 1)
+    assert row["tets"] == 48 and row["rays"] == 1024
+    assert row["ms"] > 0 and row["peak_memory_gib"] > 0
+    assert 1 < row["segments_per_ray"] < 24
+
+
 def test_the_front_holds_what_nothing_beats():
-    pareto = script("pareto")
+    pareto = importlib.import_module("pareto")
     rows = [{"ms": ms, "mean_error": error} for ms, error in [(1, 9), (2, 5), (3, 5), (4, 1), (5, 2)]]
     pareto.mark_front(rows)
     assert [row["front"] for row in rows] == [True, True, False, True, False]

@@ -159,9 +159,8 @@ def test_a_perfect_target_has_no_loss():
     impostor, batch = scene()
     output = jax.jit(render_rays, static_argnames="config")(impostor, batch.rays, RENDER, batch.jitter)
     target = jnp.column_stack([output.color, output.opacity])
-    _, metrics = stepper()(
-        init_state(impostor, OPTIMIZER, cells_per_edge=4), impostor, dataclasses.replace(batch, target=target), RATE
-    )
+    state = init_state(impostor, OPTIMIZER, cells_per_edge=4)
+    _, metrics = stepper()(state, impostor, dataclasses.replace(batch, target=target), RATE)
     assert metrics["loss"] < 1e-10  # float32 roundings, squared
 
 

@@ -9,7 +9,7 @@ from nimpostor_jax.types import BoundaryFaces, TetMesh
 
 _FACE_CORNERS = np.array(FACES)
 TETS_PER_LEAF = 2
-MAX_FACE_CLUSTERS = 2048
+MAX_FACE_CLUSTERS = 1 << 15
 
 
 def adjacency(tets: Int[np.ndarray, "T 4"]) -> Int[np.ndarray, "T 4"]:

@@ -7,13 +7,14 @@ that the ray passes, never derived from the tet's volume, so that slivers cost n
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.geometry.intersect import face_weights, project, ray_frame
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.render.traverse import CODES_PER_TET, EXIT_TRIANGLES, Crossings
 from nimpostor_jax.types import Rays, TetMesh, TetSegments
 
+ROUNDING = 8  # units in the last place of t by which a walk may go back unnoticed
 _CODES = np.arange(CODES_PER_TET)
 ENTRY_TRIANGLES = np.array([np.roll(FACES[c // 9], -(c // 3 % 3)) for c in _CODES], np.int32)
 Ends = tuple[Float[Array, "R K"], Float[Array, "R K"], Float[Array, "R K 4"], Float[Array, "R K 4"]]
@@ -24,21 +25,45 @@ def locate_segments(
 ) -> TetSegments:
     """Ends of the crossed segments beyond `near` (in the mesh's frame), as t and as barycentric coordinates.
 
-    Segments without length (grazed corners, folded tets) and those before `near` become empty slots.
+    Segments without length (grazed corners, folded tets) and those before `near` become empty slots. Where a
+    walk goes back, through inverted tets or along faces seen edge-on, the line is not covered twice: what it
+    passes again begins where it had been before.
     """
     geometry = (mesh.vertices, rays.origins, rays.directions)
     t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, crossings.codes, crossings.ends)
-    used = (crossings.codes >= 0) & (t_exit > jnp.maximum(t_enter, near))
+    behind = jnp.maximum(_covered(crossings.codes >= 0, t_enter, t_exit), near)
+    used = (crossings.codes >= 0) & (t_exit > jnp.maximum(t_enter, behind))
     length = jnp.where(used, t_exit - t_enter, 1)
-    skipped = jnp.clip((near - t_enter) / length, 0, 1)[..., None]  # share of the segment before `near`
+    skipped = jnp.clip((behind - t_enter) / length, 0, 1)[..., None]  # share of the segment before that
     return TetSegments(
         tet_ids=jnp.where(used, crossings.codes // CODES_PER_TET, -1),
-        t_enter=jnp.where(used, jnp.maximum(t_enter, near), 0),
+        t_enter=jnp.where(used, jnp.maximum(t_enter, behind), 0),
         t_exit=jnp.where(used, t_exit, 0),
         lambda_enter=jnp.where(used[..., None], lambda_enter + skipped * (lambda_exit - lambda_enter), 0),
         lambda_exit=jnp.where(used[..., None], lambda_exit, 0),
         overflow=crossings.overflow,
     )
+
+
+def _covered(
+    used: Bool[Array, "R K"], t_enter: Float[Array, "R K"], t_exit: Float[Array, "R K"]
+) -> Float[Array, "R K"]:
+    """The t up to which a slot's walk has covered the line before it; t_enter where it has not gone back."""
+    rounding = ROUNDING * jnp.finfo(t_exit.dtype).eps * (1 + jnp.abs(t_enter))
+
+    def furthest() -> Float[Array, "R K"]:
+        # Crossings of one walk share their ends to the last bit.
+        starts = jnp.pad(t_enter[:, 1:] != t_exit[:, :-1], ((0, 0), (1, 0)), constant_values=True)
+
+        def join(left: tuple, right: tuple) -> tuple:
+            (t, start), (next_t, next_start) = left, right
+            return jnp.where(next_start, next_t, jnp.maximum(t, next_t)), start | next_start
+
+        reached, _ = jax.lax.associative_scan(join, (t_exit, starts), axis=1)
+        before = jnp.concatenate([t_enter[:, :1], reached[:, :-1]], axis=1)
+        return jnp.where(starts, t_enter, before)
+
+    return jax.lax.cond(jnp.any(used & (t_enter - t_exit > rounding)), furthest, lambda: t_enter)
 
 
 @jax.custom_jvp

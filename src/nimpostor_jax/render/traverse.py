@@ -1,10 +1,10 @@
 """Ray traversal of a tetrahedral cage with fixed-size buffers (Sec. 3.4, Fig. 4).
 
-A ray enters the cage through front-facing boundary faces; a tile of rays culls clusters of them together by a
-cone. From each entry it walks from tet to tet through common faces (Fig. 4, adjacent), leaves through a
-boundary face and goes on at the next entry (separated). The walk carries the triangle through which it came,
-projected along the ray: one new vertex and three edge tests decide the way out (Aman et al. 2021), and since
-a tet is always left by another face than it was entered by, flat and inverted tets are passed as well.
+A ray enters the cage through front-facing boundary faces (`entries.py`). From each entry it walks from tet to
+tet through common faces (Fig. 4, adjacent), leaves through a boundary face and goes on at the next entry
+(separated). The walk carries the triangle through which it came, projected along the ray: one new vertex and
+three edge tests decide the way out (Aman et al. 2021), and since a tet is always left by another face than it
+was entered by, flat and inverted tets are passed as well.
 
 A crossing is coded as 9 * (4 tet + f) + 3 r + s: the tet was entered by the face opposite corner f, whose
 corners the walk holds in the order FACES[f] rotated by r, and left by the face without the s-th of these.
@@ -12,8 +12,6 @@ corners the walk holds in the order FACES[f] rotated by r, and left by the face 
 Axes: R rays, K tet slots, B entries, T tets; inside a tile the rays (lanes) are the last axis.
 Nothing here is differentiable; `segments.locate_segments` makes differentiable coordinates of the result.
 """
-
-from collections.abc import Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -23,15 +21,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.chunks import for_chunks, padded_size, take
 from nimpostor_jax.config import MarchConfig
-from nimpostor_jax.geometry.intersect import (
-    face_weights,
-    passes_left,
-    project,
-    quick_face_weights,
-    quick_passes_left,
-    ray_frame,
-)
+from nimpostor_jax.geometry import box_tree
+from nimpostor_jax.geometry.intersect import project, ray_frame
 from nimpostor_jax.geometry.tetrahedron import FACES
+from nimpostor_jax.render.entries import MarchTables, met_at, search_entries, sides
 from nimpostor_jax.types import Rays, TetMesh
 
 CPU_TILE = 256  # an image tile: a larger one has a wider cone and waits longer for its last ray
@@ -51,18 +44,6 @@ def _code_tables() -> tuple[np.ndarray, np.ndarray]:
 
 
 EXIT_FACES, EXIT_TRIANGLES = _code_tables()
-
-
-@struct.dataclass
-class MarchTables:
-    """The mesh's current geometry, rearranged for marching: made once, used for many calls."""
-
-    corners: Float[Array, "3 4T"]  # positions of the corners, column 4 tet + corner
-    next_holds: Int[Array, " 36T"]  # by code: 3 * (4 tet + f) + r on the other side; -1 outside
-    face_corners: Float[Array, "clusters width 3 3"]  # boundary faces, as seen from outside
-    face_holds: Int[Array, "clusters width"]  # 3 * (4 tet + f); -1 pads
-    cluster_centers: Float[Array, "clusters 3"]
-    cluster_radii: Float[Array, " clusters"]  # negative for empty clusters
 
 
 @struct.dataclass
@@ -102,6 +83,7 @@ def march_tables(mesh: TetMesh) -> MarchTables:
     occupied = jnp.any(used, axis=1)
     centers = jnp.where(occupied[:, None], (low + high) / 2, 0)
     radii = jnp.sqrt(jnp.sum(jnp.where(occupied[:, None], (high - low) / 2, 0) ** 2, axis=-1))
+    node_low, node_high = box_tree.refit(low, high)
     return MarchTables(
         corners=vertices[mesh.tets.reshape(-1)].T,
         next_holds=_next_holds(mesh.tets, mesh.neighbors),
@@ -109,6 +91,8 @@ def march_tables(mesh: TetMesh) -> MarchTables:
         face_holds=jnp.where(used, 3 * (4 * tets + corners), -1),
         cluster_centers=centers,
         cluster_radii=jnp.where(occupied, radii, -1),
+        node_low=node_low,
+        node_high=node_high,
     )
 
 
@@ -130,7 +114,9 @@ def find_entries(tables: MarchTables, rays: Rays, config: MarchConfig) -> Entrie
     """The front-facing boundary faces on the line of each ray; rays [R] in the mesh's own frame."""
     tiles = _Tiles(rays.origins.shape[0], config)
     lines = tuple(map(tiles.split, (rays.origins, rays.directions)))
-    holds, count, unsure = jax.lax.map(lambda line: _find_entries(tables, config, False, *line), lines)
+    holds, count, unsure = jax.lax.map(
+        lambda line: search_entries(tables, config, False, *_frame(*line)), lines
+    )
     return Entries(
         holds=tiles.join(holds),
         overflow=tiles.join(count) > config.max_entries_per_ray,
@@ -198,7 +184,7 @@ def _march_again(
     def march(start: Array, found: Crossings) -> Crossings:
         chosen = take(again, start, tile)  # past the end: read the last ray, write nothing
         origins, directions = (x.at[chosen].get(mode="clip").T for x in lines)
-        holds, count, _ = _find_entries(tables, config, True, origins, directions)
+        holds, count, _ = search_entries(tables, config, True, *_frame(origins, directions))
         codes, ends, overflow, _ = _march_tile(tables, config, True, origins, directions, holds)
         overflow |= count > config.max_entries_per_ray
         return Crossings(
@@ -232,7 +218,7 @@ def _march_tile(
         face = hold // 3
         held = jnp.asarray(FACES, jnp.int32)[face & 3]  # boundary faces are held unrotated
         points = [project(tuple(tables.corners[:, (face & ~3) + held[:, j]]), origin, axes) for j in range(3)]
-        met, _ = _met(points[0], points[1], points[2], careful)
+        met, _ = met_at(points[0], points[1], points[2], careful)
         return jnp.stack([jnp.stack(point) for point in points]), met
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
@@ -242,14 +228,14 @@ def _march_tile(
         slot, hold, points, met, entry, codes, ends, unsure = state
         active = hold >= 0
         new = jnp.stack(project(tuple(tables.corners[:, jnp.maximum(hold, 0) // 3]), origin, axes))
-        left, close = _sides(((tuple(new), tuple(points[j])) for j in range(3)), careful)
+        left, close = sides(((tuple(new), tuple(points[j])) for j in range(3)), careful)
         # The way out is the new vertex's triangle around the ray: right of one held corner, left of the next.
         # If rounding leaves none (a sliver seen edge-on), any other face than the entry advances.
         exit_slot = jnp.where(~left[1] & left[2], 0, jnp.where(~left[2] & left[0], 1, 2))
         code = jnp.where(active, 3 * hold + exit_slot, -1)
         first = jnp.where(exit_slot == 0, points[1], jnp.where(exit_slot == 1, points[2], points[0]))
         second = jnp.where(exit_slot == 0, points[2], jnp.where(exit_slot == 1, points[0], points[1]))
-        met_after, flat = _met(tuple(new), tuple(first), tuple(second), careful)
+        met_after, flat = met_at(tuple(new), tuple(first), tuple(second), careful)
         unsure |= active & (close[0] | close[1] | close[2] | flat)
         codes = jax.lax.dynamic_update_index_in_dim(codes, code, slot, 0)
         ends = jax.lax.dynamic_update_index_in_dim(ends, jnp.concatenate([met, met_after]), slot, 0)
@@ -284,121 +270,6 @@ def _march_tile(
 def _frame(origins: Float[Array, "3 lanes"], directions: Float[Array, "3 lanes"]) -> tuple[tuple, tuple]:
     """Origin and axes to `project` on, computed once for all kernels that follow."""
     return tuple(origins), jax.lax.optimization_barrier(ray_frame(tuple(directions)))
-
-
-def _sides(edges: Iterable[tuple], careful: bool) -> tuple[list[Array], list[Array]]:
-    """`passes_left` of each edge, and where that may be wrong."""
-    if careful:
-        sides = [passes_left(*edge) for edge in edges]
-        return sides, [jnp.zeros_like(side) for side in sides]
-    quick = [quick_passes_left(*edge) for edge in edges]
-    return [left for left, _ in quick], [close for _, close in quick]
-
-
-def _met(
-    a: Sequence[Array], b: Sequence[Array], c: Sequence[Array], careful: bool
-) -> tuple[Float[Array, "3 lanes"], Bool[Array, " lanes"]]:
-    """t at which the line meets a projected triangle, the weights of its first two corners, and doubt."""
-    if careful:
-        (wa, wb, wc), flat = face_weights(a, b, c), jnp.zeros(a[0].shape, bool)
-    else:
-        (wa, wb, wc), flat = quick_face_weights(a, b, c)
-    return jnp.stack([wa * a[2] + wb * b[2] + wc * c[2], wa, wb]), flat
-
-
-def _find_entries(
-    tables: MarchTables,
-    config: MarchConfig,
-    careful: bool,
-    origins: Float[Array, "3 lanes"],
-    directions: Float[Array, "3 lanes"],
-) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"], Bool[Array, " lanes"]]:
-    """The front-facing boundary faces on each lane's line by t: their holds (-1 pads), count, and doubt."""
-    origin, axes = _frame(origins, directions)
-    lanes, slots, dtype = origins.shape[1], config.max_entries_per_ray, origins.dtype
-    clusters, width = tables.face_holds.shape
-    words = _pack_bits(_near_clusters(tables, origin, axes[2]))
-
-    def test_face(i: Int[Array, ""], state: tuple) -> tuple:
-        cluster, unsure, found = state
-        hold = tables.face_holds[cluster, i]
-        a, b, c = (project(tuple(corner), origin, axes) for corner in tables.face_corners[cluster, i])
-        # Counter-clockwise from outside is clockwise along a ray that comes from outside.
-        left, close = _sides(((a, b), (b, c), (c, a)), careful)
-        hit, possible = (hold >= 0) & ~left[0] & ~left[1] & ~left[2], hold >= 0
-        for passed, doubt in zip(left, close, strict=True):
-            possible &= ~passed | doubt
-        met, flat = _met(a, b, c, careful)
-        t = jnp.where(hit, met[0], jnp.inf)
-        unsure |= (possible & (close[0] | close[1] | close[2])) | (hit & flat)
-        return cluster, unsure, jax.lax.cond(jnp.any(hit), lambda: _insert(found, t, hold), lambda: found)
-
-    def test_next_cluster(state: tuple) -> tuple:
-        word, bits, unsure, found = state
-        lowest = jax.lax.population_count(~bits & (bits - 1)).astype(jnp.int32)
-        cluster = jnp.minimum(32 * word + lowest, clusters - 1)
-        unsure, found = jax.lax.cond(
-            bits != 0,
-            lambda: jax.lax.fori_loop(0, width, test_face, (cluster, unsure, found))[1:],
-            lambda: (unsure, found),
-        )
-        bits = bits & (bits - 1)
-        word = jnp.where(bits == 0, word + 1, word)
-        bits = jnp.where(bits == 0, words[jnp.minimum(word, len(words) - 1)], bits)
-        return word, bits, unsure, found
-
-    empty = (
-        jnp.full((slots, lanes), jnp.inf, dtype),
-        jnp.full((slots, lanes), -1, jnp.int32),
-        jnp.zeros(lanes, jnp.int32),
-    )
-    start = (jnp.zeros((), jnp.int32), words[0], jnp.zeros(lanes, bool), empty)
-    end = jax.lax.while_loop(lambda s: s[0] < len(words), test_next_cluster, start)
-    _, _, unsure, (_, holds, count) = end
-    return holds, count, unsure
-
-
-def _near_clusters(tables: MarchTables, origin: tuple, direction: tuple) -> Bool[Array, " clusters"]:
-    """Clusters that some line of the tile may meet: their spheres against a double cone around all lines.
-
-    A line at angle alpha to the cone's axis, through a point within rho of its apex, is at most
-    rho + (|s| + rho) tan(alpha) from the axis at height s. A sphere adds its radius to both lengths.
-    """
-    apex = [jnp.mean(o) for o in origin]
-    mean = [jnp.mean(d) for d in direction]
-    length = jnp.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2)
-    axis = [m / jnp.maximum(length, 1e-6) for m in mean]
-    cosine = jnp.min(sum(d * a for d, a in zip(direction, axis, strict=True)))
-    tangent = jnp.sqrt(jnp.maximum(1 - cosine**2, 0)) / jnp.maximum(cosine, 1e-6)
-    rho = jnp.sqrt(jnp.max(sum((o - a) ** 2 for o, a in zip(origin, apex, strict=True))))
-
-    offset = [tables.cluster_centers[:, i] - apex[i] for i in range(3)]
-    height = sum(o * a for o, a in zip(offset, axis, strict=True))
-    squared = sum((o - height * a) ** 2 for o, a in zip(offset, axis, strict=True))
-    margin = 1e-4 * (jnp.abs(height) + tables.cluster_radii)  # rounding of cosine and height, generously
-    reach = tables.cluster_radii + rho
-    near = jnp.sqrt(squared) <= margin + reach + (jnp.abs(height) + reach) * (tangent + 1e-3)
-    return (near | (cosine < 0.1)) & (tables.cluster_radii >= 0)
-
-
-def _pack_bits(flags: Bool[Array, " n"]) -> Array:
-    """Flags as words of 32 bits, the first flag lowest."""
-    rows = jnp.pad(flags, (0, -len(flags) % 32)).reshape(-1, 32).astype(jnp.uint32)
-    return jnp.sum(rows << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
-
-
-def _insert(found: tuple, t: Float[Array, " lanes"], hold: Int[Array, ""]) -> tuple:
-    """Insert hits (t is inf elsewhere) into the lanes' lists, sorted by t; what falls off is only counted."""
-    ts, holds, count = found
-    count = count + (t < jnp.inf).astype(jnp.int32)
-    hold = jnp.full(t.shape, hold)
-    new_ts, new_holds = [], []
-    for old_t, old_hold in zip(ts, holds, strict=True):
-        before = t < old_t
-        new_ts.append(jnp.where(before, t, old_t))
-        new_holds.append(jnp.where(before, hold, old_hold))
-        t, hold = jnp.where(before, old_t, t), jnp.where(before, old_hold, hold)
-    return jnp.stack(new_ts), jnp.stack(new_holds), count
 
 
 def _pick(rows: Int[Array, "B lanes"], index: Int[Array, " lanes"]) -> Int[Array, " lanes"]:
