@@ -31,9 +31,9 @@ class MarchTables:
     """The mesh's current geometry, rearranged for marching: made once, used for many calls."""
 
     corners: Float[Array, "3 4T"]  # positions of the corners, column 4 tet + corner
-    next_holds: Int[Array, " 36T"]  # by code: 3 * (4 tet + f) + r on the other side; -1 outside
+    next_holds: Int[Array, " 36T"]  # by code: 4 * (4 tet + f) + r on the other side; -1 outside
     face_corners: Float[Array, "clusters width 3 3"]  # boundary faces, as seen from outside
-    face_holds: Int[Array, "clusters width"]  # 3 * (4 tet + f); -1 pads
+    face_holds: Int[Array, "clusters width"]  # 4 * (4 tet + f); -1 pads
     cluster_centers: Float[Array, "clusters 3"]
     cluster_radii: Float[Array, " clusters"]  # negative for empty clusters
     node_low: Float[Array, "nodes 3"]  # boxes of the tree whose leaves are the clusters (`box_tree`)
@@ -51,13 +51,13 @@ def sides(edges: Iterable[tuple], careful: bool) -> tuple[list[Array], list[Arra
 
 def met_at(
     a: Sequence[Array], b: Sequence[Array], c: Sequence[Array], careful: bool
-) -> tuple[Float[Array, "3 lanes"], Bool[Array, " lanes"]]:
+) -> tuple[tuple[Float[Array, " lanes"], ...], Bool[Array, " lanes"]]:
     """t at which the line meets a projected triangle, the weights of its first two corners, and doubt."""
     if careful:
         (wa, wb, wc), flat = face_weights(a, b, c), jnp.zeros(a[0].shape, bool)
     else:
         (wa, wb, wc), flat = quick_face_weights(a, b, c)
-    return jnp.stack([wa * a[2] + wb * b[2] + wc * c[2], wa, wb]), flat
+    return (wa * a[2] + wb * b[2] + wc * c[2], wa, wb), flat
 
 
 def search_entries(

@@ -68,7 +68,7 @@ def _covered(
 
 @jax.custom_jvp
 def _ends(
-    geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "R K"], ends: Float[Array, "6 R K"]
+    geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "R K"], ends: tuple[Float[Array, "R K"], ...]
 ) -> Ends:
     """t and coordinates at both ends, as marched; the derivatives are those of `_recomputed_ends`."""
     local = jnp.maximum(codes, 0) % CODES_PER_TET

@@ -13,6 +13,8 @@ Axes: R rays, K tet slots, B entries, T tets; inside a tile the rays (lanes) are
 Nothing here is differentiable; `segments.locate_segments` makes differentiable coordinates of the result.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -53,9 +55,13 @@ class Entries:
     Finding them costs more than marching: find them once for rays that are cast again.
     """
 
-    holds: Int[Array, "R B"]  # 3 * (4 tet + f) of the boundary face; -1 pads
+    holds: Int[Array, "R B"]  # 4 * (4 tet + f) of the boundary face; -1 pads
     overflow: Bool[Array, " R"]  # more entries than slots
     unsure: Bool[Array, " R"]  # tests were too close for the quick way: march with care
+
+
+Point = tuple[Float[Array, " lanes"], ...]
+Ends = tuple[Float[Array, "R K"], ...]  # six
 
 
 @struct.dataclass
@@ -67,7 +73,7 @@ class Crossings:
     """
 
     codes: Int[Array, "R K"]  # -1 marks an empty slot
-    ends: Float[Array, "6 R K"]
+    ends: Ends
     overflow: Bool[Array, " R"]  # more tets or entries than slots
 
 
@@ -88,7 +94,7 @@ def march_tables(mesh: TetMesh) -> MarchTables:
         corners=vertices[mesh.tets.reshape(-1)].T,
         next_holds=_next_holds(mesh.tets, mesh.neighbors),
         face_corners=triangles,
-        face_holds=jnp.where(used, 3 * (4 * tets + corners), -1),
+        face_holds=jnp.where(used, 4 * (4 * tets + corners), -1),
         cluster_centers=centers,
         cluster_radii=jnp.where(occupied, radii, -1),
         node_low=node_low,
@@ -105,7 +111,8 @@ def _next_holds(tets: Int[Array, "T 4"], neighbors: Int[Array, "T 4"]) -> Int[Ar
         other = tets[jnp.maximum(neighbor, 0)]
         held = tets[:, triangle]  # [T, 3], in the order that the walk holds them
         matches = jnp.all(other[:, rotated] == held[:, None, None, :], axis=-1)  # [T, face, rotation]
-        column = 12 * neighbor + jnp.argmax(matches.reshape(-1, 12), axis=1)
+        found = jnp.argmax(matches.reshape(-1, 12), axis=1)
+        column = 16 * neighbor + 4 * (found // 3) + found % 3
         columns.append(jnp.where(neighbor >= 0, column, -1))
     return jnp.stack(columns, axis=1).reshape(-1).astype(jnp.int32)
 
@@ -142,7 +149,7 @@ def traverse(
     )
     crossings = Crossings(
         codes=tiles.join(codes),
-        ends=tiles.join(ends.transpose(0, 2, 1, 3), axis=1),
+        ends=tuple(map(tiles.join, ends)),
         overflow=tiles.join(overflow) | entries.overflow,
     )
     return _march_again(tables, rays, config, crossings, tiles.join(unsure) | entries.unsure, tiles.size)
@@ -161,11 +168,10 @@ class _Tiles:
         padded = jnp.pad(jax.lax.stop_gradient(x), padding, mode="edge") if self.num_rays else x
         return padded.reshape(-1, self.size, x.shape[1]).transpose(0, 2, 1)
 
-    def join(self, x: Array, axis: int = 0) -> Array:
-        """[tiles, (first,) (rest,) lanes] to [(first,) R, (rest)]; `axis` is where R goes."""
+    def join(self, x: Array) -> Array:
+        """[tiles, (rest,) lanes] to [R, (rest)]."""
         lanes_second = jnp.moveaxis(x, -1, 1)
-        joined = lanes_second.reshape(-1, *lanes_second.shape[2:])[: self.num_rays]
-        return jnp.moveaxis(joined, 0, axis)
+        return lanes_second.reshape(-1, *lanes_second.shape[2:])[: self.num_rays]
 
 
 def _march_again(
@@ -189,7 +195,9 @@ def _march_again(
         overflow |= count > config.max_entries_per_ray
         return Crossings(
             codes=found.codes.at[chosen].set(codes.T, mode="drop"),
-            ends=found.ends.at[:, chosen].set(ends.transpose(1, 2, 0), mode="drop"),
+            ends=tuple(
+                old.at[chosen].set(new.T, mode="drop") for old, new in zip(found.ends, ends, strict=True)
+            ),
             overflow=found.overflow.at[chosen].set(overflow, mode="drop"),
         )
 
@@ -203,44 +211,51 @@ def _march_tile(
     origins: Float[Array, "3 lanes"],
     directions: Float[Array, "3 lanes"],
     entry_holds: Int[Array, "B lanes"],
-) -> tuple[Int[Array, "K lanes"], Float[Array, "K 6 lanes"], Bool[Array, " lanes"], Bool[Array, " lanes"]]:
-    """Codes and ends, overflow, and the lanes on which tests were too close for the quick way."""
+) -> tuple[Int[Array, "K lanes"], Ends, Bool[Array, " lanes"], Bool[Array, " lanes"]]:
+    """Codes and ends, overflow, and the lanes on which tests were too close for the quick way.
+
+    The next vertex is projected at the end of each step and carried into the next: XLA compiles a kernel
+    for each of a step's results, and each would repeat a projection that is not carried. For the same reason
+    nothing is stacked: points are three arrays each.
+    """
     origin, axes = _frame(origins, directions)
     lanes, slots = origins.shape[1], config.max_tets_per_ray
 
-    def held_triangle(
-        hold: Int[Array, " lanes"],
-    ) -> tuple[Float[Array, "3 3 lanes"], Float[Array, "3 lanes"]]:
+    def corner(column: Int[Array, " lanes"]) -> Point:
+        return project([row[column] for row in tables.corners], origin, axes)
+
+    def held_triangle(hold: Int[Array, " lanes"]) -> tuple[tuple[Point, Point, Point], Point]:
         """The face that is entered, projected from scratch (at the cage's boundary), and where it is met.
 
         Whether it is seen edge-on has been noted when it was found.
         """
-        face = hold // 3
+        face = hold >> 2
         held = jnp.asarray(FACES, jnp.int32)[face & 3]  # boundary faces are held unrotated
-        points = [project(tuple(tables.corners[:, (face & ~3) + held[:, j]]), origin, axes) for j in range(3)]
-        met, _ = met_at(points[0], points[1], points[2], careful)
-        return jnp.stack([jnp.stack(point) for point in points]), met
+        a, b, c = (corner((face & ~3) + held[:, j]) for j in range(3))
+        met, _ = met_at(a, b, c, careful)
+        return (a, b, c), met
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
         return (state[0] < slots) & jnp.any(state[1] >= 0)
 
     def step(state: tuple) -> tuple:
-        slot, hold, points, met, entry, codes, ends, unsure = state
+        slot, hold, new, (a, b, c), met, entry, codes, ends, unsure = state
         active = hold >= 0
-        new = jnp.stack(project(tuple(tables.corners[:, jnp.maximum(hold, 0) // 3]), origin, axes))
-        left, close = sides(((tuple(new), tuple(points[j])) for j in range(3)), careful)
+        left, close = sides([(new, a), (new, b), (new, c)], careful)
         # The way out is the new vertex's triangle around the ray: right of one held corner, left of the next.
         # If rounding leaves none (a sliver seen edge-on), any other face than the entry advances.
         exit_slot = jnp.where(~left[1] & left[2], 0, jnp.where(~left[2] & left[0], 1, 2))
-        code = jnp.where(active, 3 * hold + exit_slot, -1)
-        first = jnp.where(exit_slot == 0, points[1], jnp.where(exit_slot == 1, points[2], points[0]))
-        second = jnp.where(exit_slot == 0, points[2], jnp.where(exit_slot == 1, points[0], points[1]))
-        met_after, flat = met_at(tuple(new), tuple(first), tuple(second), careful)
+        code = jnp.where(active, 9 * (hold >> 2) + 3 * (hold & 3) + exit_slot, -1)
+        first = _choose(exit_slot, b, c, a)
+        second = _choose(exit_slot, c, a, b)
+        met_after, flat = met_at(new, first, second, careful)
         unsure |= active & (close[0] | close[1] | close[2] | flat)
         codes = jax.lax.dynamic_update_index_in_dim(codes, code, slot, 0)
-        ends = jax.lax.dynamic_update_index_in_dim(ends, jnp.concatenate([met, met_after]), slot, 0)
+        ends = tuple(
+            jax.lax.dynamic_update_index_in_dim(old, value, slot, 0)
+            for old, value in zip(ends, (*met, *met_after), strict=True)
+        )
 
-        points = jnp.stack([new, first, second])
         hold = jnp.where(active, tables.next_holds[jnp.maximum(code, 0)], -1)
         reenters = active & (hold < 0)
         hold = jnp.where(reenters, _pick(entry_holds, entry), hold)
@@ -248,23 +263,34 @@ def _march_tile(
         reenters &= hold >= 0
 
         def reenter() -> tuple:
-            triangle, met_again = held_triangle(jnp.maximum(hold, 0))
-            return jnp.where(reenters, triangle, points), jnp.where(reenters, met_again, met_after)
+            entered = held_triangle(jnp.maximum(hold, 0))
+            return jax.tree.map(partial(jnp.where, reenters), entered, ((new, first, second), met_after))
 
-        points, met = jax.lax.cond(jnp.any(reenters), reenter, lambda: (points, met_after))
-        return slot + 1, hold, points, met, entry, codes, ends, unsure
+        points, met = jax.lax.cond(
+            jnp.any(reenters), reenter, lambda: ((new, first, second), met_after)
+        )
+        return slot + 1, hold, corner(jnp.maximum(hold, 0) >> 2), points, met, entry, codes, ends, unsure
 
+    first_hold = jnp.maximum(entry_holds[0], 0)
     start = (
         jnp.zeros((), jnp.int32),
-        entry_holds[0],  # 3 * (4 tet + f) + r; -1 when the ray is done
-        *held_triangle(jnp.maximum(entry_holds[0], 0)),
+        entry_holds[0],  # 4 * (4 tet + f) + r; -1 when the ray is done
+        corner(first_hold >> 2),
+        *held_triangle(first_hold),
         jnp.ones(lanes, jnp.int32),  # the next entry to take
         jnp.full((slots, lanes), -1, jnp.int32),
-        jnp.zeros((slots, 6, lanes), origins.dtype),
+        tuple(jnp.zeros((slots, lanes), origins.dtype) for _ in range(6)),
         jnp.zeros(lanes, bool),
     )
-    _, hold, _, _, _, codes, ends, unsure = jax.lax.while_loop(unfinished, step, start)
+    _, hold, _, _, _, _, codes, ends, unsure = jax.lax.while_loop(unfinished, step, start)
     return codes, ends, hold >= 0, unsure
+
+
+def _choose(slot: Int[Array, " lanes"], zero: Point, one: Point, two: Point) -> Point:
+    """The point for each lane's slot."""
+    return tuple(
+        jnp.where(slot == 0, x, jnp.where(slot == 1, y, z)) for x, y, z in zip(zero, one, two, strict=True)
+    )
 
 
 def _frame(origins: Float[Array, "3 lanes"], directions: Float[Array, "3 lanes"]) -> tuple[tuple, tuple]:
