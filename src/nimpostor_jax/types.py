@@ -67,11 +67,11 @@ class TetSegments:
     Barycentric coordinates are affine along a ray, so the two ends give every point between (Eq. 3).
     """
 
-    tet_ids: Int[Array, "R K"]  # -1 marks an empty slot
-    t_enter: Float[Array, "R K"]
-    t_exit: Float[Array, "R K"]  # never before t_enter
-    lambda_enter: Float[Array, "R K 4"]
-    lambda_exit: Float[Array, "R K 4"]
+    tet_ids: Int[Array, "K R"]  # -1 marks an empty slot
+    t_enter: Float[Array, "K R"]
+    t_exit: Float[Array, "K R"]  # never before t_enter
+    lambda_enter: Float[Array, "K R 4"]
+    lambda_exit: Float[Array, "K R 4"]
     overflow: Bool[Array, " R"]  # more tets or entries than slots: the tail is missing
 
 

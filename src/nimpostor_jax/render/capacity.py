@@ -52,8 +52,8 @@ def _demand(
     local = to_local(mesh, rays)
     crossings = traverse(tables, local, config.march)
     segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
-    total = jnp.sum(segment_measure(segments, config.sampler.measure), axis=1)
-    return jnp.max(jnp.sum(crossings.codes >= 0, axis=1)), jnp.any(crossings.overflow), total
+    total = jnp.sum(segment_measure(segments, config.sampler.measure), axis=0)
+    return jnp.max(jnp.sum(crossings.codes >= 0, axis=0)), jnp.any(crossings.overflow), total
 
 
 def fit_capacities(

@@ -4,7 +4,7 @@ A ray's samples are spaced evenly, or with Eq. 4's cone growth, in a measure tha
 Rays need different numbers of samples: they share a buffer of M slots, so that nothing is computed for
 samples that a ray does not have.
 
-Axes: R rays, K tet slots, S samples a ray at most, M packed samples.
+Axes: K tet slots, R rays, S samples a ray at most, M packed samples.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import map_used, packed_indices
+from nimpostor_jax.chunks import map_used, packed_indices, running
 from nimpostor_jax.config import Measure, SamplerConfig
 from nimpostor_jax.types import TetSegments
 
@@ -36,7 +36,7 @@ class Samples:
     coarsened: Bool[Array, " R"]  # the ray needed more than S samples and got larger steps
 
 
-def segment_measure(segments: TetSegments, measure: Measure) -> Float[Array, "R K"]:
+def segment_measure(segments: TetSegments, measure: Measure) -> Float[Array, "K R"]:
     """Extent of each segment: L1 barycentric distance (Eq. 9), 1 a tet (Eq. 4), or length; 0 if empty."""
     if measure == "barycentric":
         return jnp.sum(jnp.abs(segments.lambda_exit - segments.lambda_enter), axis=-1)
@@ -67,11 +67,12 @@ def sample_segments(
     depend neither on the batch around the ray nor on the number of devices. Steps are scaled down so that a
     whole number of them fills the ray exactly. Empty rays get no samples. `refinement` divides a ray's steps.
     """
-    num_rays, max_samples = segments.tet_ids.shape[0], config.max_samples_per_ray
+    num_slots, num_rays = segments.tet_ids.shape
+    max_samples = config.max_samples_per_ray
     capacity = num_rays * (config.capacity_per_ray or max_samples)
     extents = segment_measure(segments, config.measure)
-    ends = jnp.cumsum(extents, axis=1)
-    total = ends[:, -1]
+    ends = jnp.cumsum(extents, axis=0)
+    total = ends[-1]
     boundaries = jnp.asarray(step_boundaries(config), ends.dtype)
     # The tolerance keeps a ray of exactly n steps from getting n + 1 by rounding.
     asked = jax.lax.stop_gradient(total if refinement is None else total * refinement)
@@ -79,19 +80,25 @@ def sample_segments(
     wanted = jnp.where(total > 0, jnp.clip(fits, 1, max_samples), 0)
     scale = total / boundaries[jnp.maximum(wanted, 1)]
     counts = jnp.clip(capacity - (jnp.cumsum(wanted) - wanted), 0, wanted)
-    before = _samples_before(config, ends, extents, boundaries, scale, counts, jitter)
-    in_segment = jnp.diff(before, axis=1, prepend=0).reshape(-1)
+    firsts = jnp.cumsum(counts) - counts
 
-    flat = jnp.arange(in_segment.size, dtype=jnp.int32)
-    segment = jnp.repeat(flat, in_segment, total_repeat_length=capacity)
+    # Each segment with samples marks its first; what it marks ascends, so that a running maximum spreads it.
+    before = _samples_before(config, ends, extents, boundaries, scale, counts, jitter)
+    starts = jnp.pad(before[:-1], ((1, 0), (0, 0)))
+    slots = jnp.arange(num_slots, dtype=jnp.int32)[:, None]
+    marks = jnp.arange(num_rays, dtype=jnp.int32) * num_slots + slots
+    places = jnp.where(before > starts, firsts + starts, capacity)
+    marked = jnp.zeros(capacity, jnp.int32).at[places.reshape(-1)].set(marks.reshape(-1), mode="drop")
+    marked = running(jnp.maximum, marked, 0)
+    rays, slot = marked // num_slots, marked % num_slots
+    segment = slot * num_rays + rays
     packed, num_used = jnp.arange(capacity, dtype=jnp.int32), jnp.sum(counts)
     used = packed < num_used
-    rays = segment // segments.tet_ids.shape[1]
-    slots = jnp.clip(packed - (jnp.cumsum(counts) - counts)[rays], 0, max_samples - 1)
-    low, high = boundaries[slots], boundaries[slots + 1]
-    position = (low + _share(slots, jitter, rays) * (high - low)) * scale[rays]
+    steps = jnp.clip(packed - firsts[rays], 0, max_samples - 1)
+    low, high = boundaries[steps], boundaries[steps + 1]
+    position = (low + _share(steps, jitter, rays) * (high - low)) * scale[rays]
 
-    def pick(values: Float[Array, "R K *rest"]) -> Float[Array, "M *rest"]:
+    def pick(values: Float[Array, "K R *rest"]) -> Float[Array, "M *rest"]:
         return values.reshape(-1, *values.shape[2:])[segment]
 
     extent, end = pick(extents), pick(ends)
@@ -115,35 +122,35 @@ def sample_segments(
 
 
 def _share(
-    slots: Int[Array, "*batch"], jitter: Float[Array, " R"] | None, rays: Int[Array, "*batch"]
+    steps: Int[Array, "*batch"], jitter: Float[Array, " R"] | None, rays: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"] | float:
     """Where in its step a ray's sample is."""
-    return 0.5 if jitter is None else (jitter[rays] + GOLDEN_RATIO * slots) % 1
+    return 0.5 if jitter is None else (jitter[rays] + GOLDEN_RATIO * steps) % 1
 
 
 def _samples_before(
     config: SamplerConfig,
-    ends: Float[Array, "R K"],
-    extents: Float[Array, "R K"],
+    ends: Float[Array, "K R"],
+    extents: Float[Array, "K R"],
     boundaries: Float[Array, " S+1"],
     scale: Float[Array, " R"],
     counts: Int[Array, " R"],
     jitter: Float[Array, " R"] | None,
-) -> Int[Array, "R K"]:
+) -> Int[Array, "K R"]:
     """How many of its ray's samples lie before the end of each segment; none lies in an empty one."""
     # A parallel sum need not repeat itself over empty slots.
-    ends = jax.lax.cummax(jnp.where(extents > 0, ends, 0), axis=1)
-    position = ends / jnp.where(scale > 0, scale, 1)[:, None]
+    ends = jax.lax.cummax(jnp.where(extents > 0, ends, 0), axis=0)
+    position = ends / jnp.where(scale > 0, scale, 1)
     if config.cone_angle == 0:
         step = (position / config.step).astype(jnp.int32)
     else:
         step = jnp.searchsorted(boundaries, position, side="right").astype(jnp.int32) - 1
     step = jnp.clip(step, 0, boundaries.size - 2)
-    rays = jnp.broadcast_to(jnp.arange(len(ends))[:, None], ends.shape)
+    rays = jnp.broadcast_to(jnp.arange(ends.shape[1]), ends.shape)
     low, high = boundaries[step], boundaries[step + 1]
     before = step + (low + _share(step, jitter, rays) * (high - low) < position)
-    last = ends >= ends[:, -1:] * (1 - 2 * jnp.finfo(ends.dtype).eps)  # rounding leaves no sample behind it
-    return jnp.where(last, counts[:, None], jnp.minimum(before, counts[:, None]))
+    last = ends >= ends[-1] * (1 - 2 * jnp.finfo(ends.dtype).eps)  # rounding leaves no sample behind it
+    return jnp.where(last, counts, jnp.minimum(before, counts))
 
 
 def select_samples(samples: Samples, keep: Bool[Array, " M"], values: Any = None) -> tuple[Samples, Any]:

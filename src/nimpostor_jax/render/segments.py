@@ -1,6 +1,6 @@
 """Where each ray enters and leaves its tets: differentiable in vertices and rays (Eq. 3).
 
-Axes: R rays, K tet slots. Barycentric coordinates of the entry and exit points are those within the faces
+Axes: K tet slots, R rays. Barycentric coordinates of the entry and exit points are those within the faces
 that the ray passes, never derived from the tet's volume, so that slivers cost no precision.
 """
 
@@ -17,7 +17,7 @@ from nimpostor_jax.types import Rays, TetMesh, TetSegments
 ROUNDING = 8  # units in the last place of t by which a walk may go back unnoticed
 _CODES = np.arange(CODES_PER_TET)
 ENTRY_TRIANGLES = np.array([np.roll(FACES[c // 9], -(c // 3 % 3)) for c in _CODES], np.int32)
-Ends = tuple[Float[Array, "R K"], Float[Array, "R K"], Float[Array, "R K 4"], Float[Array, "R K 4"]]
+Ends = tuple[Float[Array, "K R"], Float[Array, "K R"], Float[Array, "K R 4"], Float[Array, "K R 4"]]
 
 
 def locate_segments(
@@ -46,21 +46,21 @@ def locate_segments(
 
 
 def _covered(
-    used: Bool[Array, "R K"], t_enter: Float[Array, "R K"], t_exit: Float[Array, "R K"]
-) -> Float[Array, "R K"]:
+    used: Bool[Array, "K R"], t_enter: Float[Array, "K R"], t_exit: Float[Array, "K R"]
+) -> Float[Array, "K R"]:
     """The t up to which a slot's walk has covered the line before it; t_enter where it has not gone back."""
     rounding = ROUNDING * jnp.finfo(t_exit.dtype).eps * (1 + jnp.abs(t_enter))
 
-    def furthest() -> Float[Array, "R K"]:
+    def furthest() -> Float[Array, "K R"]:
         # Crossings of one walk share their ends to the last bit.
-        starts = jnp.pad(t_enter[:, 1:] != t_exit[:, :-1], ((0, 0), (1, 0)), constant_values=True)
+        starts = jnp.pad(t_enter[1:] != t_exit[:-1], ((1, 0), (0, 0)), constant_values=True)
 
         def join(left: tuple, right: tuple) -> tuple:
             (t, start), (next_t, next_start) = left, right
             return jnp.where(next_start, next_t, jnp.maximum(t, next_t)), start | next_start
 
-        reached, _ = jax.lax.associative_scan(join, (t_exit, starts), axis=1)
-        before = jnp.concatenate([t_enter[:, :1], reached[:, :-1]], axis=1)
+        reached, _ = jax.lax.associative_scan(join, (t_exit, starts))
+        before = jnp.concatenate([t_enter[:1], reached[:-1]])
         return jnp.where(starts, t_enter, before)
 
     return jax.lax.cond(jnp.any(used & (t_enter - t_exit > rounding)), furthest, lambda: t_enter)
@@ -68,7 +68,7 @@ def _covered(
 
 @jax.custom_jvp
 def _ends(
-    geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "R K"], ends: tuple[Float[Array, "R K"], ...]
+    geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "K R"], ends: tuple[Float[Array, "K R"], ...]
 ) -> Ends:
     """t and coordinates at both ends, as marched; the derivatives are those of `_recomputed_ends`."""
     local = jnp.maximum(codes, 0) % CODES_PER_TET
@@ -86,13 +86,13 @@ def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Ends, Ends]:
     return _ends(*primals), tangents_out
 
 
-def _recomputed_ends(geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "R K"]) -> Ends:
+def _recomputed_ends(geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "K R"]) -> Ends:
     """What the march computed, as a differentiable function of vertices, origins and directions."""
     vertices, origins, directions = geometry
     codes = jnp.maximum(codes, 0)
     tet_ids, local = codes // CODES_PER_TET, codes % CODES_PER_TET
-    origin = tuple(origins[:, None, i] for i in range(3))
-    axes = ray_frame(tuple(directions[:, None, i] for i in range(3)))
+    origin = tuple(origins[:, i] for i in range(3))
+    axes = ray_frame(tuple(directions[:, i] for i in range(3)))
     ts, lambdas = [], []
     for triangles in (ENTRY_TRIANGLES, EXIT_TRIANGLES):
         triangle = jnp.asarray(triangles)[local]
@@ -105,8 +105,8 @@ def _recomputed_ends(geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array,
 
 
 def _spread(
-    triangle: Int[Array, "R K 3"], wa: Float[Array, "R K"], wb: Float[Array, "R K"]
-) -> Float[Array, "R K 4"]:
+    triangle: Int[Array, "K R 3"], wa: Float[Array, "K R"], wb: Float[Array, "K R"]
+) -> Float[Array, "K R 4"]:
     """The tet's four coordinates from weights of three of its corners."""
     columns = []
     for i in range(4):

@@ -9,11 +9,12 @@ was entered by, flat and inverted tets are passed as well.
 A crossing is coded as 9 * (4 tet + f) + 3 r + s: the tet was entered by the face opposite corner f, whose
 corners the walk holds in the order FACES[f] rotated by r, and left by the face without the s-th of these.
 
-Axes: R rays, K tet slots, B entries, T tets; inside a tile the rays (lanes) are the last axis.
+Axes: K tet slots, R rays, B entries, T tets. Rays are the last axis, in tiles ("lanes") and in the result.
 Nothing here is differentiable; `segments.locate_segments` makes differentiable coordinates of the result.
 """
 
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +62,7 @@ class Entries:
 
 
 Point = tuple[Float[Array, " lanes"], ...]
-Ends = tuple[Float[Array, "R K"], ...]  # six
+Ends = tuple[Float[Array, "K R"], ...]  # six
 
 
 @struct.dataclass
@@ -72,7 +73,7 @@ class Crossings:
     the same three numbers of the triangle after it (`EXIT_TRIANGLES`).
     """
 
-    codes: Int[Array, "R K"]  # -1 marks an empty slot
+    codes: Int[Array, "K R"]  # -1 marks an empty slot
     ends: Ends
     overflow: Bool[Array, " R"]  # more tets or entries than slots
 
@@ -142,17 +143,31 @@ def traverse(
     """
     if entries is None:
         entries = find_entries(tables, rays, config)
-    tiles = _Tiles(rays.origins.shape[0], config)
-    parts = (rays.origins, rays.directions, entries.holds)
-    codes, ends, overflow, unsure = jax.lax.map(
-        lambda parts: _march_tile(tables, config, False, *parts), tuple(map(tiles.split, parts))
-    )
-    crossings = Crossings(
-        codes=tiles.join(codes),
-        ends=tuple(map(tiles.join, ends)),
-        overflow=tiles.join(overflow) | entries.overflow,
-    )
-    return _march_again(tables, rays, config, crossings, tiles.join(unsure) | entries.unsure, tiles.size)
+    tiles, slots = _Tiles(rays.origins.shape[0], config), config.max_tets_per_ray
+    parts = tuple(map(tiles.split, (rays.origins, rays.directions, entries.holds)))
+    num_tiles = parts[0].shape[0]
+
+    def march(tile: Int[Array, ""], found: tuple) -> tuple:
+        rows, overflow, unsure = found
+        line = [jax.lax.dynamic_index_in_dim(x, tile, keepdims=False) for x in parts]
+        column = tile * tiles.size
+        rows, full, doubt = _march_tile(tables, config, False, line[0], line[1], line[2], rows, column)
+        overflow = jax.lax.dynamic_update_slice(overflow, full, (column,))
+        return rows, overflow, jax.lax.dynamic_update_slice(unsure, doubt, (column,))
+
+    # Tiles write into the rays' own columns: nothing is stacked, and nothing transposed.
+    none = jnp.zeros(num_tiles * tiles.size, bool)
+    found = (_empty_rows(slots, num_tiles * tiles.size, rays.origins.dtype), none, none)
+    if num_tiles:  # a loop over none is traced too, and would read the first tile
+        found = jax.lax.fori_loop(0, num_tiles, march, found)
+    rows, overflow, unsure = jax.tree.map(lambda x: x[..., : tiles.num_rays], found)
+    crossings = Crossings(codes=rows[0], ends=rows[1], overflow=overflow | entries.overflow)
+    return _march_again(tables, rays, config, crossings, unsure | entries.unsure, tiles.size)
+
+
+def _empty_rows(slots: int, lanes: int, dtype: Any) -> tuple[Int[Array, "K lanes"], Ends]:
+    """Codes and ends before the march."""
+    return jnp.full((slots, lanes), -1, jnp.int32), tuple(jnp.zeros((slots, lanes), dtype) for _ in range(6))
 
 
 class _Tiles:
@@ -191,12 +206,13 @@ def _march_again(
         chosen = take(again, start, tile)  # past the end: read the last ray, write nothing
         origins, directions = (x.at[chosen].get(mode="clip").T for x in lines)
         holds, count, _ = search_entries(tables, config, True, *_frame(origins, directions))
-        codes, ends, overflow, _ = _march_tile(tables, config, True, origins, directions, holds)
+        rows = _empty_rows(config.max_tets_per_ray, tile, origins.dtype)
+        (codes, ends), overflow, _ = _march_tile(tables, config, True, origins, directions, holds, rows, 0)
         overflow |= count > config.max_entries_per_ray
         return Crossings(
-            codes=found.codes.at[chosen].set(codes.T, mode="drop"),
+            codes=found.codes.at[:, chosen].set(codes, mode="drop"),
             ends=tuple(
-                old.at[chosen].set(new.T, mode="drop") for old, new in zip(found.ends, ends, strict=True)
+                old.at[:, chosen].set(new, mode="drop") for old, new in zip(found.ends, ends, strict=True)
             ),
             overflow=found.overflow.at[chosen].set(overflow, mode="drop"),
         )
@@ -211,8 +227,11 @@ def _march_tile(
     origins: Float[Array, "3 lanes"],
     directions: Float[Array, "3 lanes"],
     entry_holds: Int[Array, "B lanes"],
-) -> tuple[Int[Array, "K lanes"], Ends, Bool[Array, " lanes"], Bool[Array, " lanes"]]:
-    """Codes and ends, overflow, and the lanes on which tests were too close for the quick way.
+    rows: tuple[Int[Array, "K R"], Ends],
+    column: Int[Array, ""] | int,
+) -> tuple[tuple[Int[Array, "K R"], Ends], Bool[Array, " lanes"], Bool[Array, " lanes"]]:
+    """Codes and ends with this tile's written from `column` on; overflow; and the lanes on which tests were
+    too close for the quick way.
 
     The next vertex is projected at the end of each step and carried into the next: XLA compiles a kernel
     for each of a step's results, and each would repeat a projection that is not carried. For the same reason
@@ -239,7 +258,7 @@ def _march_tile(
         return (state[0] < slots) & jnp.any(state[1] >= 0)
 
     def step(state: tuple) -> tuple:
-        slot, hold, new, (a, b, c), met, entry, codes, ends, unsure = state
+        slot, hold, new, (a, b, c), met, entry, rows, unsure = state
         active = hold >= 0
         left, close = sides([(new, a), (new, b), (new, c)], careful)
         # The way out is the new vertex's triangle around the ray: right of one held corner, left of the next.
@@ -250,10 +269,9 @@ def _march_tile(
         second = _choose(exit_slot, c, a, b)
         met_after, flat = met_at(new, first, second, careful)
         unsure |= active & (close[0] | close[1] | close[2] | flat)
-        codes = jax.lax.dynamic_update_index_in_dim(codes, code, slot, 0)
-        ends = tuple(
-            jax.lax.dynamic_update_index_in_dim(old, value, slot, 0)
-            for old, value in zip(ends, (*met, *met_after), strict=True)
+        values = code, (*met, *met_after)
+        rows = jax.tree.map(
+            lambda row, value: jax.lax.dynamic_update_slice(row, value[None], (slot, column)), rows, values
         )
 
         hold = jnp.where(active, tables.next_holds[jnp.maximum(code, 0)], -1)
@@ -269,7 +287,7 @@ def _march_tile(
         points, met = jax.lax.cond(
             jnp.any(reenters), reenter, lambda: ((new, first, second), met_after)
         )
-        return slot + 1, hold, corner(jnp.maximum(hold, 0) >> 2), points, met, entry, codes, ends, unsure
+        return slot + 1, hold, corner(jnp.maximum(hold, 0) >> 2), points, met, entry, rows, unsure
 
     first_hold = jnp.maximum(entry_holds[0], 0)
     start = (
@@ -278,12 +296,11 @@ def _march_tile(
         corner(first_hold >> 2),
         *held_triangle(first_hold),
         jnp.ones(lanes, jnp.int32),  # the next entry to take
-        jnp.full((slots, lanes), -1, jnp.int32),
-        tuple(jnp.zeros((slots, lanes), origins.dtype) for _ in range(6)),
+        rows,
         jnp.zeros(lanes, bool),
     )
-    _, hold, _, _, _, _, codes, ends, unsure = jax.lax.while_loop(unfinished, step, start)
-    return codes, ends, hold >= 0, unsure
+    _, hold, _, _, _, _, rows, unsure = jax.lax.while_loop(unfinished, step, start)
+    return rows, hold >= 0, unsure
 
 
 def _choose(slot: Int[Array, " lanes"], zero: Point, one: Point, two: Point) -> Point:
