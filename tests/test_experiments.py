@@ -50,7 +50,8 @@ def test_a_lost_a_doubled_and_a_broken_segment_are_noticed(marched):
     ray, slot = np.unravel_index(np.argmax(length), length.shape)
     lost = segments.replace(t_exit=segments.t_exit.at[ray, slot].set(segments.t_enter[ray, slot]))
     assert errors_of(stress, solid, lines, lost)[ray] == pytest.approx(-length[ray, slot], abs=1e-3)
-    assert stress.color_errors(mesh, solid, lost, lines, 1e-4).max() > 0.01
+    halved = segments.replace(t_exit=(segments.t_enter + segments.t_exit) / 2)
+    assert stress.color_errors(mesh, solid, halved, lines, 1e-4).max() > 0.01
     longer = segments.replace(t_exit=segments.t_exit.at[ray, slot].add(0.1))
     assert errors_of(stress, solid, lines, longer)[ray] > 0.09
     twice = jnp.concatenate([segments.t_enter, segments.t_enter], axis=1)
