@@ -35,7 +35,7 @@ from nimpostor_jax.render.frame import Frame, frame_config, render_frame
 from nimpostor_jax.render.traverse import Crossings, march_tables, traverse
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays, TetMesh
 
-CROSSINGS = Crossings(codes=SPLIT, ends=P(None, *SPLIT), overflow=SPLIT)
+CROSSINGS = Crossings(codes=P(None, *SPLIT), ends=(P(None, *SPLIT),) * 6, overflow=SPLIT)
 LOST = 1e-4  # of the ball's radius: a ray that is shorter or longer by more has lost or doubled a segment
 ROUNDING = 1e-6  # how far float32 moves a ray that starts a few radii away
 
@@ -194,8 +194,9 @@ def _march_facts(work: Work, mesh: TetMesh, rays: Rays, found: Crossings) -> Row
     """Counts, and how many of some rays are not as long inside the cage as float64 says."""
     step = max(1, len(rays.origins) // work.checked_rays)
     checked = np.arange(0, len(rays.origins), step)
-    ends = np.asarray(found.ends[:, checked], np.float64)
-    lengths = np.where(np.asarray(found.codes[checked]) >= 0, np.maximum(ends[3] - ends[0], 0), 0).sum(axis=1)
+    first, last = (np.asarray(found.ends[i][:, checked], np.float64) for i in (0, 3))
+    used = np.asarray(found.codes[:, checked]) >= 0
+    lengths = np.where(used, np.maximum(last - first, 0), 0).sum(axis=0)
     origins, directions = (np.asarray(x)[checked].astype(np.float64) for x in (rays.origins, rays.directions))
     lengths = float(mesh.scale) * lengths
     cage = world_vertices(mesh), np.asarray(mesh.tets)

@@ -135,9 +135,9 @@ def stress(case: Case, dtype: str, rounds: int, seed: Any) -> Row:
         row["nonfinite"] += count_nonfinite(segments)
         few = np.arange(min(COLORED, len(error)))
         sigma = DENSITIES[turn % len(DENSITIES)]
-        some_rays, some_segments = jax.tree.map(lambda x, few=few: x[few], (rays, segments))
-        some_crossings = crossings.replace(
-            codes=crossings.codes[few], ends=crossings.ends[:, few], overflow=crossings.overflow[few]
+        some_rays = jax.tree.map(lambda x, few=few: x[few], rays)
+        some_segments, some_crossings = jax.tree.map(
+            lambda x, few=few: x[:, few] if x.ndim > 1 else x[few], (segments, crossings)
         )
         gradients = color_gradients(mesh, some_rays, some_crossings, near, sigma)
         row["nonfinite"] += count_nonfinite(gradients)
@@ -180,14 +180,14 @@ def march_rays(
     """Segments beyond `near`, in the mesh's frame, and their length, less what is walked backwards."""
     crossings = traverse(march_tables(mesh), rays, march)
     t_enter, t_exit = (jnp.maximum(crossings.ends[i].astype(jnp.float64), near) for i in (0, 3))
-    walked = jnp.sum(jnp.where(crossings.codes >= 0, t_exit - t_enter, 0), axis=1)
+    walked = jnp.sum(jnp.where(crossings.codes >= 0, t_exit - t_enter, 0), axis=0)
     return crossings, locate_segments(mesh, rays, crossings, near), walked
 
 
 @jax.jit
 def lengths(segments: TetSegments) -> jax.Array:
     """Length of all segments of each ray, [R], summed in float64."""
-    return jnp.sum(segments.t_exit.astype(jnp.float64) - segments.t_enter, axis=1)
+    return jnp.sum(segments.t_exit.astype(jnp.float64) - segments.t_enter, axis=0)
 
 
 def palette(points: Any) -> Any:
@@ -210,8 +210,9 @@ def segment_colors(mesh: TetMesh, segments: TetSegments, sigma: Any) -> jax.Arra
     thin, thick = jnp.minimum(depth, 1e-2), jnp.maximum(depth, 1e-2)
     place = 1 / thick - 1 / jnp.expm1(jnp.minimum(thick, 50))  # beyond, the second term is below rounding
     place = jnp.where(depth > 1e-2, place, 0.5 - thin / 12 + thin**3 / 720)[..., None]
-    weights = sample_weights(depth)[..., None]
-    return jnp.sum(weights * jnp.concatenate([first + place * (last - first), jnp.ones_like(place)], -1), 1)
+    rays = jnp.broadcast_to(jnp.arange(depth.shape[1], dtype=jnp.int32)[:, None], depth.T.shape)
+    weights = sample_weights(depth.T.reshape(-1), rays.reshape(-1)).reshape(rays.shape).T[..., None]
+    return jnp.sum(weights * jnp.concatenate([first + place * (last - first), jnp.ones_like(place)], -1), 0)
 
 
 @jax.jit
@@ -237,8 +238,8 @@ def count_nonfinite(tree: Any) -> int:
 def overlapping(segments: TetSegments, tolerance: float) -> jax.Array:
     """Rays on which a segment of some length begins before an earlier one has ended."""
     long = segments.t_exit - segments.t_enter > tolerance
-    before = jax.lax.cummax(jnp.where(long, segments.t_exit, -jnp.inf), axis=1)[:, :-1]
-    return jnp.any(long[:, 1:] & (segments.t_enter[:, 1:] < before - tolerance), axis=1)
+    before = jax.lax.cummax(jnp.where(long, segments.t_exit, -jnp.inf), axis=0)[:-1]
+    return jnp.any(long[1:] & (segments.t_enter[1:] < before - tolerance), axis=0)
 
 
 def chord_errors(
@@ -285,7 +286,7 @@ def color_errors(
 ) -> np.ndarray:
     """Largest error over densities and channels, of the rays whose colour rounding does not change."""
     cut = pieces(solid, lines)
-    clear, errors = np.ones(len(segments.tet_ids), bool), np.zeros(len(segments.tet_ids))
+    clear, errors = np.ones(len(lines.origins), bool), np.zeros(len(lines.origins))
     for sigma in DENSITIES:
         ours = np.asarray(segment_colors(mesh, segments, sigma), np.float64)
         ends = np.stack(color_range(cut, lines, sigma, palette))

@@ -102,7 +102,7 @@ def with_slivers(geometry: Geometry, aspect: float) -> Geometry:
 
 
 def scrambled_inside(rng: np.random.Generator) -> Case:
-    """A grid whose vertices have moved by up to a cell: a third of the tets is inverted."""
+    """A grid whose vertices have moved by up to a cell: a fifth of the tets is inverted."""
     vertices, tets = kuhn_grid(3, 3, 3)
     return Case((vertices, tets), moved=vertices + rng.uniform(-0.6, 0.6, vertices.shape))
 

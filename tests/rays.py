@@ -1,5 +1,6 @@
 """Rays for the tests of the renderer, as NumPy float64: (origins [R,3], directions [R,3])."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -81,3 +82,8 @@ GENERIC = {"generic": generic, "missing": missing}
 DEGENERATE = {
     f.__name__: f for f in (through_vertices, through_edges, along_edges, along_faces, along_axes)
 }  # fmt: skip
+
+
+def by_ray(tree):
+    """Segments or crossings with rays as the first axis and slots as the second, and back."""
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1) if x.ndim > 1 else x, tree)

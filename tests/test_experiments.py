@@ -49,14 +49,15 @@ def test_the_oracle_agrees_with_the_march(marched):
 def test_a_lost_a_doubled_and_a_broken_segment_are_noticed(marched):
     stress, solid, lines, segments, mesh = marched
     length = np.asarray(segments.t_exit - segments.t_enter)
-    ray, slot = np.unravel_index(np.argmax(length), length.shape)
-    lost = segments.replace(t_exit=segments.t_exit.at[ray, slot].set(segments.t_enter[ray, slot]))
-    assert errors_of(stress, solid, lines, lost)[ray] == pytest.approx(-length[ray, slot], abs=1e-3)
-    assert stress.color_errors(mesh, solid, lost, lines, 1e-4).max() > 0.01
-    longer = segments.replace(t_exit=segments.t_exit.at[ray, slot].add(0.1))
+    slot, ray = np.unravel_index(np.argmax(length), length.shape)
+    lost = segments.replace(t_exit=segments.t_exit.at[slot, ray].set(segments.t_enter[slot, ray]))
+    assert errors_of(stress, solid, lines, lost)[ray] == pytest.approx(-length[slot, ray], abs=1e-3)
+    halved = segments.replace(t_exit=(segments.t_enter + segments.t_exit) / 2)
+    assert stress.color_errors(mesh, solid, halved, lines, 1e-4).max() > 0.01
+    longer = segments.replace(t_exit=segments.t_exit.at[slot, ray].add(0.1))
     assert errors_of(stress, solid, lines, longer)[ray] > 0.09
-    twice = jnp.concatenate([segments.t_enter, segments.t_enter], axis=1)
-    twice_exit = jnp.concatenate([segments.t_exit, segments.t_exit], axis=1)
+    twice = jnp.concatenate([segments.t_enter, segments.t_enter])
+    twice_exit = jnp.concatenate([segments.t_exit, segments.t_exit])
     assert stress.overlapping(segments.replace(t_enter=twice, t_exit=twice_exit), 1e-4)[ray]
     broken = segments.replace(t_enter=segments.t_enter.at[0, 0].set(jnp.nan))
     assert stress.count_nonfinite(broken) == 1

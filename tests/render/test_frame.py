@@ -143,7 +143,7 @@ def test_growth_is_tried_to_its_end_and_then_an_error(growth, monkeypatch):
     mesh = tet_mesh("delaunay")
     tables, rays = march_tables(mesh), sample_rays(mesh, generic)
     needed = int(
-        np.max(np.sum(np.asarray(traverse(tables, to_local(mesh, rays), MarchConfig()).codes) >= 0, axis=1))
+        np.max(np.sum(np.asarray(traverse(tables, to_local(mesh, rays), MarchConfig()).codes) >= 0, axis=0))
     )
     start = -(-needed // 4)
     config = dataclasses.replace(

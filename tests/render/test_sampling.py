@@ -11,7 +11,7 @@ import oracles
 import pytest
 from meshes import local_vertices, tet_mesh
 from numpy.testing import assert_allclose, assert_array_equal
-from rays import as_rays, generic, missing
+from rays import as_rays, by_ray, generic, missing
 
 from nimpostor_jax.config import MarchConfig, SamplerConfig
 from nimpostor_jax.render.sampling import (
@@ -58,7 +58,7 @@ def segments_of(*rays, slots=4):
             if tet >= 0:
                 enter[r, k], exit_[r, k] = low, high
                 lambdas[0, r, k, 0] = lambdas[1, r, k, 1] = 1
-    return TetSegments(
+    segments = TetSegments(
         tet_ids=jnp.asarray(ids, jnp.int32),
         t_enter=jnp.asarray(enter, jnp.float32),
         t_exit=jnp.asarray(exit_, jnp.float32),
@@ -66,6 +66,7 @@ def segments_of(*rays, slots=4):
         lambda_exit=jnp.asarray(lambdas[1], jnp.float32),
         overflow=jnp.zeros(len(rays), bool),
     )
+    return by_ray(segments)
 
 
 def used(samples):
@@ -108,7 +109,7 @@ def test_intervals_sum_to_the_rays_measure(measure, cone):
     samples = sample(segments, config, measure)
     points = used(samples)
     total = np.bincount(points["rays"], points["deltas"], minlength=COUNT)
-    assert_allclose(total, np.sum(segment_measure(segments, measure), axis=1), rtol=1e-5)
+    assert_allclose(total, np.sum(segment_measure(segments, measure), axis=0), rtol=1e-5)
     assert np.all(points["deltas"] > 0)
 
 
@@ -118,10 +119,10 @@ def test_measures_match_the_oracle():
         expected = oracles.ray_segments(*local_vertices(mesh), origin, direction)
         bary = sum(np.abs(s[4] - s[3]).sum() for s in expected)
         length = sum(s[1] - s[0] for s in expected)
-        assert_allclose(np.sum(segment_measure(segments, "barycentric")[ray]), bary, atol=1e-4)
-        assert_allclose(np.sum(segment_measure(segments, "euclidean")[ray]), length, atol=1e-4)
-        assert np.sum(segment_measure(segments, "alpha")[ray]) == np.sum(
-            np.asarray(segments.tet_ids)[ray] >= 0
+        assert_allclose(np.sum(segment_measure(segments, "barycentric")[:, ray]), bary, atol=1e-4)
+        assert_allclose(np.sum(segment_measure(segments, "euclidean")[:, ray]), length, atol=1e-4)
+        assert np.sum(segment_measure(segments, "alpha")[:, ray]) == np.sum(
+            np.asarray(segments.tet_ids)[:, ray] >= 0
         )
 
 
@@ -132,7 +133,7 @@ def test_a_mixed_density_measure_converges_to_the_rays_measure():
     points = used(sample(segments, config, "euclidean"))
     total = np.bincount(points["rays"], points["deltas"], minlength=COUNT)
     # steps that straddle two tets are attributed to one: an error of the order of the step per tet
-    assert_allclose(total, np.sum(segment_measure(segments, "euclidean"), axis=1), rtol=0.02)
+    assert_allclose(total, np.sum(segment_measure(segments, "euclidean"), axis=0), rtol=0.02)
 
 
 def test_equal_steps_no_longer_than_asked_for_and_samples_in_their_middle():
@@ -225,7 +226,7 @@ def test_jitter_does_not_depend_on_the_batch():
     jitter = jnp.linspace(0, 0.99, COUNT)
     whole = used(sample(segments, CONFIG, "barycentric", jitter))
     order = np.random.default_rng(0).permutation(COUNT)[: COUNT // 2]
-    part = jax.tree.map(lambda x: x[order], segments)
+    part = jax.tree.map(lambda x: x[:, order] if x.ndim > 1 else x[order], segments)
     samples = used(sample(part, CONFIG, "barycentric", jitter[order]))
     for position, ray in enumerate(order):
         assert_array_equal(samples["t"][samples["rays"] == position], whole["t"][whole["rays"] == ray])

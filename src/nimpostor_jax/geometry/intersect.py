@@ -157,6 +157,9 @@ def _turned(first: Lanes, second: Lanes, values: Sequence[Lanes]) -> tuple[Lanes
 
 
 def _share(part: Lanes, whole: Lanes) -> Lanes:
-    """part / whole in [0, 1]; 1/2 with zero gradient where the whole is 0."""
-    valid = whole != 0
+    """part / whole in [0, 1]; 1/2 with zero gradient where the whole is 0, or so little that it is rounding.
+
+    Two of these follow on each other: their slopes, multiplied, must not overflow.
+    """
+    valid = jnp.abs(whole) > jnp.finfo(whole.dtype).tiny ** 0.25  # 3e-10 in float32
     return jnp.where(valid, jnp.clip(part / jnp.where(valid, whole, 1), 0, 1), 0.5)

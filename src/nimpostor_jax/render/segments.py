@@ -33,8 +33,9 @@ def locate_segments(
     t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, crossings.codes, crossings.ends)
     behind = jnp.maximum(_covered(crossings.codes >= 0, t_enter, t_exit), near)
     used = (crossings.codes >= 0) & (t_exit > jnp.maximum(t_enter, behind))
-    length = jnp.where(used, t_exit - t_enter, 1)
-    skipped = jnp.clip((behind - t_enter) / length, 0, 1)[..., None]  # share of the segment before that
+    cut = used & (t_enter < behind)  # a division only where it counts: lengths may be next to 0
+    skipped = jnp.where(cut, behind - t_enter, 0) / jnp.where(cut, t_exit - t_enter, 1)
+    skipped = skipped[..., None]  # share of the segment before that
     return TetSegments(
         tet_ids=jnp.where(used, crossings.codes // CODES_PER_TET, -1),
         t_enter=jnp.where(used, jnp.maximum(t_enter, behind), 0),

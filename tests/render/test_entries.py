@@ -1,0 +1,73 @@
+"""Entries and walks where faces have no area, tets are inverted, or the boundary has many faces."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from meshes import grid, local_vertices, tet_mesh
+from numpy.testing import assert_array_equal
+from rays import DEGENERATE, GENERIC, as_rays, by_ray
+
+from nimpostor_jax.config import MarchConfig
+from nimpostor_jax.geometry.tetrahedron import num_inverted
+from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.render import entries
+from nimpostor_jax.render.segments import locate_segments
+from nimpostor_jax.render.traverse import march_tables, traverse
+
+CONFIG = MarchConfig(max_tets_per_ray=40, max_entries_per_ray=4, tile_size=64)
+COUNT = 32
+
+
+@jax.jit
+def walk(mesh, rays):
+    return by_ray(locate_segments(mesh, rays, traverse(march_tables(mesh), rays, CONFIG)))
+
+
+@pytest.mark.parametrize("name", ["nonconvex", "blobs"])
+def test_a_tree_finds_the_entries_that_a_tile_finds(name, rng, monkeypatch):
+    mesh = tet_mesh(name)
+    kinds = [make(*local_vertices(mesh), rng, COUNT) for make in (GENERIC | DEGENERATE).values()]
+    rays = as_rays(tuple(np.concatenate(parts) for parts in zip(*kinds, strict=True)))
+    expected = jax.jit(traverse, static_argnums=2)(march_tables(mesh), rays, CONFIG)
+    monkeypatch.setattr(entries, "MAX_CULLED", 0)
+    jax.clear_caches()  # the limit is read while tracing
+    found = jax.jit(traverse, static_argnums=2)(march_tables(mesh), rays, CONFIG)
+    jax.clear_caches()
+    assert_array_equal(found.codes, expected.codes)
+    assert not found.overflow.any()
+
+
+def test_a_collapsed_cage_seen_along_a_flattened_face_is_not_entered_there():
+    """Faces without area project to a point along their line: no side of them is left or right."""
+    vertices, tets = grid(np.ones((2, 2, 3), bool))
+    mesh = build_tet_mesh(vertices, tets)
+    moved = np.asarray(mesh.vertices).copy()
+    layers = np.unique(moved[:, 2])
+    moved[moved[:, 2] == layers[2], 2] = layers[1]
+    flat = mesh.replace(vertices=jnp.asarray(moved))
+    origins = moved[moved[:, 2] == layers[1]] - np.array([0, 3, 0])
+    rays = (origins, np.broadcast_to([0.0, 1.0, 0.0], origins.shape))
+    segments = walk(flat, as_rays(rays))
+    assert not np.any(segments.overflow)
+    lengths = np.sum(np.asarray(segments.t_exit - segments.t_enter), axis=1)
+    side = np.ptp(moved[:, 1])
+    assert np.all((lengths < 1e-5) | (np.abs(lengths - side) < 1e-5))
+
+
+def test_a_fold_covers_the_line_once(rng):
+    """An inner vertex beyond its neighbours: the walk goes there, back, and on; no part counts twice."""
+    vertices, tets = grid(np.ones((2, 2, 2), bool))
+    mesh = build_tet_mesh(vertices, tets)
+    moved = np.asarray(mesh.vertices).copy()
+    middle = np.argmin(np.sum(moved**2, axis=1))
+    moved[middle] = np.max(moved) * np.array([1.5, 0.05, 0.02])
+    folded = mesh.replace(vertices=jnp.asarray(moved))
+    assert num_inverted(folded.vertices, folded.tets) > 0
+    y, z = rng.uniform(-0.3, 0.3, (2, 64))
+    rays = (np.stack([np.full(64, -3.0), y, z], axis=1), np.broadcast_to([1.0, 0.0, 0.0], (64, 3)))
+    segments = walk(folded, as_rays(rays))
+    for ray in range(64):
+        used = np.asarray(segments.tet_ids[ray]) >= 0
+        enters, exits = (np.asarray(t[ray])[used] for t in (segments.t_enter, segments.t_exit))
+        assert np.all(enters[1:] >= exits[:-1] - 1e-6)
