@@ -39,9 +39,8 @@ def whole_image(impostor, camera, config):
     rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2))
     output = render(impostor, rays, config)
     shape = (camera.height, camera.width)
-    return {
-        name: np.asarray(getattr(output, name)).reshape(*shape, -1).squeeze() for name in frames.Frame._fields
-    }
+    names = ("color", "opacity", "depth", "coarsened")
+    return {name: np.asarray(getattr(output, name)).reshape(*shape, -1).squeeze() for name in names}
 
 
 def check_equal(frame, expected):
@@ -66,6 +65,22 @@ def test_overflow_is_repaired(scene):
     config = exact(capacity_per_ray=2)
     config = dataclasses.replace(config, march=MarchConfig(max_tets_per_ray=3, max_entries_per_ray=2))
     check_equal(render_frame(impostor, camera, config), expected)
+
+
+def test_a_tolerance_is_met(scene):
+    """Against steps 32 times as fine as the config's: here that is converged."""
+    impostor, camera = scene
+    fine = exact(step=RENDER.sampler.step / 64, max_samples_per_ray=2048)
+    expected = render_frame(impostor, camera, fine)
+    errors = {}
+    for tolerance in (None, 1 / 255):
+        frame = render_frame(impostor, camera, RENDER, tolerance)
+        errors[tolerance] = np.max(np.abs(frame.color - expected.color), axis=-1)
+        assert (frame.error is None) == (tolerance is None)
+    assert errors[None].max() > 4 / 255  # the test could not fail otherwise
+    assert np.mean(errors[1 / 255] <= 1 / 255) >= 0.999
+    with pytest.raises(ValueError, match="tolerance must be > 0"):
+        render_frame(impostor, camera, RENDER, 0.0)
 
 
 def test_what_cannot_be_repaired_is_an_error_and_no_picture(scene, monkeypatch):

@@ -73,9 +73,10 @@ def render_frame(
     are rendered again, fewer at a time, in larger ones; raises RuntimeError where 2**6 times the given sizes
     do not suffice.
 
-    With a `tolerance`, each pixel's steps are halved until halving changes neither its colour nor its opacity
-    by more than half of that; the last change is returned as `error`. It stays above where steps of
-    1 / `MAX_REFINEMENT` are too long. Samples below `min_weight` are left out all the same.
+    With a `tolerance`, each pixel's steps are halved until that hardly changes its colour and opacity: by a
+    32nd of the tolerance, or by half of it after a change within it. The last change is returned as `error`;
+    it is larger where 1 / `MAX_REFINEMENT` of the steps did not suffice. One small change is no proof: two
+    coarse quadratures may miss the same detail. Samples below `min_weight` are left out all the same.
     """
     height, width = camera.height, camera.width
     if tolerance is not None:
@@ -95,14 +96,15 @@ def render_frame(
             frame[name][order[pixels]] = value
 
     write(pixels, output)
-    refinement = 2
+    refinement, before = 2, np.full(len(pixels), np.inf)  # the change by the halving before
     while tolerance is not None and pixels.size and refinement <= MAX_REFINEMENT:
         finer = view.render(pixels, refinement)
         change = np.abs(np.column_stack([finer[name] - output[name] for name in ("color", "opacity")]))
-        finer["error"] = change.max(axis=1)
-        write(pixels, finer)
-        pending = finer["error"] > tolerance / 2
-        pixels, output = pixels[pending], {name: value[pending] for name, value in finer.items()}
+        change = change.max(axis=1)
+        write(pixels, finer | {"error": change})
+        done = (change <= tolerance / 32) | ((change <= tolerance / 2) & (before <= tolerance))
+        pixels, before = pixels[~done], change[~done]
+        output = {name: value[~done] for name, value in finer.items()}
         refinement *= 2
     if tolerance is None:
         del frame["error"]

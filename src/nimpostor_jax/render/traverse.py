@@ -239,6 +239,7 @@ def _march_tile(
     """
     origin, axes = _frame(origins, directions)
     lanes, slots = origins.shape[1], config.max_tets_per_ray
+    column = jnp.asarray(column).astype(jnp.int32)  # as the slot, in x64 too
 
     def corner(column: Int[Array, " lanes"]) -> Point:
         return project([row[column] for row in tables.corners], origin, axes)
