@@ -33,7 +33,7 @@ class EncodingConfig:
 
     layout: Layout = "per_simplex"
     interpolation: Interpolation = "simplex"
-    num_levels: int = 7
+    num_levels: int = 7  # at most: training leaves out levels with cells below half a pixel
     features_per_level: int = 2
     base_resolution: int = 1
     growth: float = 2.0

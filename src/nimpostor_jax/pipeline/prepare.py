@@ -30,6 +30,8 @@ from nimpostor_jax.types import NeuralImpostor
 
 Log = Callable[[str], None]
 
+MIN_CELL = 0.5  # pixels across a cell of the finest level
+
 
 def use_all_cores() -> None:
     """Give XLA's CPU back end one device a core, over which training and frames are spread.
@@ -88,17 +90,28 @@ def prepare(
     pool, missed = build_pool(mesh, train.cameras, train.images, config.render.march)
     log(f"{len(pool.views):,} training rays hit the cage; {missed:.4%} of opaque pixels do not")
     key = jax.random.key(config.train.seed)
+    config = fit_levels(config, pixels_per_cell(vertices, tets, train, 1), log)
     impostor = init_impostor(key, mesh, config.impostor)
     entries = np.diff(impostor.tables.layout.starts).tolist()
     log(f"{len(tets)} tets, {sum(entries):,} table entries in {len(entries)} levels {entries}")
-    finest = config.impostor.encoding.resolutions[-1]
-    log(f"the finest grid cell is {pixels_per_cell(vertices, tets, train, finest):.2f} pixels wide")
     probe = draw_batch(key, 0, pool, min(config.train.rays_per_batch, 8192), "white")
     entries = pool.entries.holds.shape[1]
     march = dataclasses.replace(config.render.march, max_entries_per_ray=entries)
     render = dataclasses.replace(config.render, march=march)
     render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, render)
     return Scene(config=config, train=train, test=test, impostor=impostor, pool=pool, render=render)
+
+
+def fit_levels(config: ExperimentConfig, pixels_per_edge: float, log: Log = print) -> ExperimentConfig:
+    """The config without levels whose cells are narrower than `MIN_CELL` pixels: nothing could train them."""
+    encoding = config.impostor.encoding
+    kept = [n for n in encoding.resolutions if pixels_per_edge / n >= MIN_CELL] or encoding.resolutions[:1]
+    log(
+        f"the finest of {len(kept)} levels has cells {pixels_per_edge / kept[-1]:.2f} pixels wide"
+        + (f"; {encoding.num_levels} were asked for" if len(kept) < encoding.num_levels else "")
+    )
+    encoding = dataclasses.replace(encoding, num_levels=len(kept))
+    return dataclasses.replace(config, impostor=dataclasses.replace(config.impostor, encoding=encoding))
 
 
 def pixels_per_cell(
@@ -109,7 +122,7 @@ def pixels_per_cell(
 ) -> float:
     """Width in pixels of a grid cell of the given resolution, on the median edge at the median distance.
 
-    About 1 is right for the finest level: choose `EncodingConfig.num_levels` by it.
+    Between 1/2 and 1 is right for the finest level.
     """
     edges = vertices[tets[:, [0, 0, 0, 1, 1, 2]]] - vertices[tets[:, [1, 2, 3, 2, 3, 3]]]
     distances = np.linalg.norm(views.camera_to_world[:, :3, 3] - vertices.mean(axis=0), axis=1)
