@@ -45,20 +45,17 @@ def encode(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""] | int | None = None,
-    known: Float[Array, "M L*F"] | None = None,
 ) -> Float[Array, "M L*F"]:
     """Features f_p of points given by tet and barycentric coordinates, all levels concatenated (Eq. 6).
 
     Differentiable in the tables and, between grid nodes, in the coordinates, in reverse mode. Where only the
-    first `num_used` points matter, no more than their chunks are computed; the rest is 0. Where the result is
-    `known` from an earlier pass, it is returned as it is, and only its gradient is left to compute.
+    first `num_used` points matter, no more than their chunks are computed; the rest is 0.
     """
     num_points = tet_ids.shape[0]
     chunk = default_chunk(num_points)
     used = jnp.asarray(num_points if num_used is None else num_used, jnp.int32)
     tet_ids, lambdas = pad_items((tet_ids, lambdas), chunk)
-    known = known if known is None else pad_items(known, chunk)
-    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used, known)[:num_points]
+    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used)[:num_points]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -70,14 +67,11 @@ def _encode(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""],
-    known: Float[Array, "M L*F"] | None,
 ) -> Float[Array, "M L*F"]:
     """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best.
 
     All chunks of a level come before the next level: its entries come into the cache once, not per chunk.
     """
-    if known is not None:
-        return known
     points = _points(config, chunk, layout, tet_ids, lambdas, num_used)
 
     def add_level(level: Array, corners: _CornersOf, address: _AddressOf, out: Array) -> Array:
@@ -86,14 +80,13 @@ def _encode(
             weights, nodes = corners(part.coordinates)
             rows = (_rows(features, address(part, node)) for node in nodes)
             total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
-            return jax.lax.dynamic_update_slice(out, jnp.expand_dims(total, 0), (level, start, jnp.int32(0)))
+            return jax.lax.dynamic_update_slice(out, total[:, None], (start, level, jnp.int32(0)))
 
         return for_chunks(num_used, chunk, encode_chunk, out)
 
-    num_points, num_features = tet_ids.shape[0], features.shape[1]
-    out = jnp.zeros((config.num_levels, num_points, num_features), features.dtype)
-    out = _for_levels(config, layout, add_level, out)
-    return out.transpose(1, 0, 2).reshape(num_points, -1)
+    shape = (tet_ids.shape[0], config.num_levels, features.shape[1])
+    out: Any = _for_levels(config, layout, add_level, jnp.zeros(shape, features.dtype))
+    return jnp.reshape(out, (shape[0], -1))
 
 
 def _encode_forward(config: EncodingConfig, chunk: int, *primals: Any) -> tuple[Array, tuple]:
@@ -107,18 +100,20 @@ def _encode_backward(
     config: EncodingConfig, chunk: int, residuals: tuple, cotangent: Float[Array, "M L*F"] | SymbolicZero
 ) -> tuple:
     """Scatters into the tables, and gathers for the coordinates, only where that gradient is used."""
-    (features, layout, tet_ids, lambdas, num_used, _), (of_features, of_lambdas) = residuals
+    (features, layout, tet_ids, lambdas, num_used), (of_features, of_lambdas) = residuals
     if isinstance(cotangent, SymbolicZero):
-        return (None,) * 6
+        return (None,) * 5
     points = _points(config, chunk, layout, tet_ids, lambdas, num_used)
-    d_levels = cotangent.reshape(len(tet_ids), config.num_levels, -1).transpose(1, 0, 2)
+    d_levels = cotangent.reshape(len(tet_ids), config.num_levels, -1)
 
     def add_level(level: Array, corners: _CornersOf, address: _AddressOf, sums: tuple) -> tuple:
         def encode_chunk(start: Array, sums: tuple) -> tuple:
             d_features, d_coordinates = sums
             part = take(points, start, chunk)
             weights, pull, nodes = jax.vjp(corners, part.coordinates, has_aux=True)
-            d_level = take(jax.lax.dynamic_index_in_dim(d_levels, level, keepdims=False), start, chunk)
+            d_level = jax.lax.dynamic_slice(
+                d_levels, (start, level, jnp.int32(0)), (chunk, 1, d_levels.shape[2])
+            )[:, 0]
             d_weights = []
             for weight, node in zip(weights, nodes, strict=True):
                 entries = address(part, node)
@@ -139,7 +134,7 @@ def _encode_backward(
     d_coordinates = None if of_lambdas is None else jax.tree.map(jnp.zeros_like, points.coordinates)
     d_features, d_coordinates = _for_levels(config, layout, add_level, (d_features, d_coordinates))
     if of_lambdas is None:
-        return d_features, None, None, None, None, None
+        return d_features, None, None, None, None
 
     def pull_chunk(start: Array, d_lambdas: Array) -> Array:
         canonical = partial(_canonical, layout, config, take(tet_ids, start, chunk))
@@ -147,7 +142,7 @@ def _encode_backward(
         return put(d_lambdas, start, *pull(take(d_coordinates, start, chunk)))
 
     d_lambdas = for_chunks(num_used, chunk, pull_chunk, jnp.zeros_like(lambdas))
-    return d_features, None, None, d_lambdas, None, None
+    return d_features, None, None, d_lambdas, None
 
 
 _encode.defvjp(_encode_forward, _encode_backward, symbolic_zeros=True)

@@ -59,11 +59,10 @@ def render_samples(
         keep = in_occupied_cells(impostor.occupied, samples.tet_ids, samples.lambdas)
         if jitter is not None:
             keep |= _looks_everywhere(jitter)[samples.rays]
-        samples, _ = select_samples(samples, keep)
-    known = None
+        samples = select_samples(samples, keep)
     if config.min_weight > 0:
-        samples, known = _visible(impostor, samples, config)
-    return _integrate(impostor, local, samples, known, segments.overflow, config), samples
+        samples = _visible(impostor, samples, config)
+    return _integrate(impostor, local, samples, segments.overflow, config), samples
 
 
 def _looks_everywhere(jitter: Float[Array, " R"]) -> Bool[Array, " R"]:
@@ -75,12 +74,11 @@ def _integrate(
     impostor: NeuralImpostor,
     rays: Rays,
     samples: Samples,
-    known: Float[Array, "M C"] | None,
     overflow: Array,
     config: RenderConfig,
 ) -> RenderOutput:
     num_used = samples.num_used
-    point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used, known)
+    point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used)
     directions = field.encode_directions(impostor, rays.directions)
 
     def decode(shared: tuple, part: tuple) -> tuple[Array, Array]:
@@ -115,19 +113,16 @@ def _weights(sigmas: Float[Array, " M"], samples: Samples) -> Float[Array, " M"]
     return sample_weights(sigmas * samples.deltas, samples.rays)
 
 
-def _visible(
-    impostor: NeuralImpostor, samples: Samples, config: RenderConfig
-) -> tuple[Samples, Float[Array, "M C"]]:
-    """The samples that contribute at least `min_weight`, found by a pass without gradient; their features.
+def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig) -> Samples:
+    """The samples that contribute at least `min_weight`, found by a pass over densities without gradient.
 
     Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
     """
     frozen, seen = jax.lax.stop_gradient((impostor, samples))
 
-    def evaluate(frozen: NeuralImpostor, part: tuple) -> tuple[Array, Array]:
+    def densities(frozen: NeuralImpostor, part: tuple) -> Array:
         tet_ids, lambdas = part
-        point_features = field.features(frozen, tet_ids, lambdas)
-        return field.density(frozen, tet_ids, point_features), point_features
+        return field.density(frozen, tet_ids, field.features(frozen, tet_ids, lambdas))
 
-    sigmas, point_features = map_used(evaluate, frozen, (seen.tet_ids, seen.lambdas), seen.num_used)
-    return select_samples(samples, _weights(sigmas, seen) >= config.min_weight, point_features)
+    sigmas = map_used(densities, frozen, (seen.tet_ids, seen.lambdas), seen.num_used)
+    return select_samples(samples, _weights(sigmas, seen) >= config.min_weight)

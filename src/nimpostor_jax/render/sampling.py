@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import map_used, packed_indices, running
+from nimpostor_jax.chunks import default_chunk, map_used, packed_indices, padded_size, running
 from nimpostor_jax.config import Measure, SamplerConfig
 from nimpostor_jax.types import TetSegments
 
@@ -70,6 +70,7 @@ def sample_segments(
     num_slots, num_rays = segments.tet_ids.shape
     max_samples = config.max_samples_per_ray
     capacity = num_rays * (config.capacity_per_ray or max_samples)
+    capacity = padded_size(capacity, default_chunk(capacity))  # whole chunks need no padding later
     extents = segment_measure(segments, config.measure)
     ends = jnp.cumsum(extents, axis=0)
     total = ends[-1]
@@ -153,8 +154,8 @@ def _samples_before(
     return jnp.where(last, counts, jnp.minimum(before, counts))
 
 
-def select_samples(samples: Samples, keep: Bool[Array, " M"], values: Any = None) -> tuple[Samples, Any]:
-    """Only the samples to keep, in the same order at the buffer's start; so too `values` [M, ...] of them."""
+def select_samples(samples: Samples, keep: Bool[Array, " M"]) -> Samples:
+    """Only the samples to keep, in the same order at the buffer's start."""
     capacity = samples.t.shape[0]
     keep &= samples.deltas > 0
     chosen, num_used = packed_indices(keep)
@@ -163,8 +164,8 @@ def select_samples(samples: Samples, keep: Bool[Array, " M"], values: Any = None
     def gather(columns: Any, chosen: Array) -> Any:
         return jax.tree.map(lambda x: x[chosen], columns)
 
-    (tet_ids, lambdas, t, deltas, rays), values = map_used(gather, (columns, values), chosen, num_used)
-    selected = Samples(
+    tet_ids, lambdas, t, deltas, rays = map_used(gather, columns, chosen, num_used)
+    return Samples(
         tet_ids=tet_ids,
         lambdas=lambdas,
         t=t,
@@ -174,4 +175,3 @@ def select_samples(samples: Samples, keep: Bool[Array, " M"], values: Any = None
         overflow=samples.overflow,
         coarsened=samples.coarsened,
     )
-    return selected, values
