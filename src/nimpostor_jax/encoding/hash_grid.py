@@ -80,13 +80,13 @@ def _encode(
             weights, nodes = corners(part.coordinates)
             rows = (_rows(features, address(part, node)) for node in nodes)
             total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
-            return jax.lax.dynamic_update_slice(out, total[:, None], (start, level, jnp.int32(0)))
+            return jax.lax.dynamic_update_slice(out, jnp.expand_dims(total, 1), (start, level, jnp.int32(0)))
 
         return for_chunks(num_used, chunk, encode_chunk, out)
 
     shape = (tet_ids.shape[0], config.num_levels, features.shape[1])
-    out: Any = _for_levels(config, layout, add_level, jnp.zeros(shape, features.dtype))
-    return jnp.reshape(out, (shape[0], -1))
+    out = _for_levels(config, layout, add_level, jnp.zeros(shape, features.dtype))
+    return out.reshape(shape[0], -1)
 
 
 def _encode_forward(config: EncodingConfig, chunk: int, *primals: Any) -> tuple[Array, tuple]:

@@ -47,7 +47,7 @@ def use_all_cores() -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Let glibc reuse large blocks: XLA takes its buffers anew for each call, and fresh pages cost a tenth."""
+    """Let glibc reuse large blocks: XLA takes buffers anew for each call, and fresh pages cost a tenth."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # another C library
