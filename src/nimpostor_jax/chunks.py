@@ -155,15 +155,15 @@ def materialize(cotangents: Any) -> Any:
 
 def split_moving(arguments: Any) -> tuple[Any, Any]:
     """A custom VJP's arguments: leaves that are differentiated, and others; None in each other's place."""
-    moving, fixed = (
-        jax.tree.map(
-            lambda x, keep=keep: x.value if x.perturbed == keep else None,
-            arguments,
-            is_leaf=lambda x: isinstance(x, CustomVJPPrimal),
-        )
-        for keep in (True, False)
-    )
-    return moving, fixed
+
+    def part(keep: bool) -> Any:
+        def choose(x: CustomVJPPrimal) -> Any:
+            moves = x.perturbed and jnp.issubdtype(x.value.dtype, jnp.inexact)  # integers have no gradient
+            return x.value if moves == keep else None
+
+        return jax.tree.map(choose, arguments, is_leaf=lambda x: isinstance(x, CustomVJPPrimal))
+
+    return part(True), part(False)
 
 
 def join_moving(moving: Any, fixed: Any) -> Any:

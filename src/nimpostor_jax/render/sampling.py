@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import default_chunk, map_used, packed_indices, padded_size, running
+from nimpostor_jax.chunks import default_chunk, map_used, packed_indices, running
 from nimpostor_jax.config import Measure, SamplerConfig
 from nimpostor_jax.types import TetSegments
 
@@ -70,7 +70,7 @@ def sample_segments(
     num_slots, num_rays = segments.tet_ids.shape
     max_samples = config.max_samples_per_ray
     capacity = num_rays * (config.capacity_per_ray or max_samples)
-    capacity = padded_size(capacity, default_chunk(capacity))  # whole chunks need no padding later
+    capacity += -capacity % default_chunk(capacity)  # whole chunks need no padding later
     extents = segment_measure(segments, config.measure)
     ends = jnp.cumsum(extents, axis=0)
     total = ends[-1]
