@@ -110,7 +110,7 @@ def traverse_vs_embree(work: Work) -> Match:
     origins, directions = (np.asarray(x, np.float64) for x in (rays.origins, rays.directions))
 
     def describe(ours: Crossings, peer: EmbreeSegments) -> Row:
-        segments = np.sum(np.asarray(ours.codes) >= 0, axis=1)
+        segments = np.sum(np.asarray(ours.codes) >= 0, axis=0)
         same = segments == np.bincount(peer.rays, minlength=len(segments))
         return _march_facts(work, mesh, rays, ours) | {"agree": float(same.mean())}
 
@@ -165,8 +165,8 @@ def _against_open3d(work: Work, rays: Rays) -> Match:
 
     def describe(ours: Crossings, peer: np.ndarray) -> Row:
         codes = np.asarray(ours.codes)
-        faces_met = np.sum((codes >= 0) + ((codes >= 0) & exits[codes]).astype(int), axis=1)
-        same = faces_met == np.bincount(peer.astype(np.int64), minlength=len(codes))
+        faces_met = np.sum((codes >= 0) + ((codes >= 0) & exits[codes]).astype(int), axis=0)
+        same = faces_met == np.bincount(peer.astype(np.int64), minlength=codes.shape[1])
         return _march_facts(work, mesh, rays, ours) | {"agree": float(same.mean())}
 
     return Match(_marching(mesh, rays), peer, describe)
