@@ -7,8 +7,10 @@ and `peer_threads` state it; a peer with 1 is written for one thread. `ratio` is
 ours is faster.
 """
 
+import contextlib
 import dataclasses
 import os
+import tempfile
 import time
 from collections.abc import Callable
 from functools import cache, partial
@@ -127,7 +129,8 @@ def ball() -> tuple[np.ndarray, np.ndarray]:
     import pytetwild
 
     surface = trimesh.creation.icosphere(subdivisions=2)
-    vertices, tets = pytetwild.tetrahedralize(surface.vertices, surface.faces, edge_length_fac=0.25)[:2]
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # it leaves a file where it runs
+        vertices, tets = pytetwild.tetrahedralize(surface.vertices, surface.faces, edge_length_fac=0.25)[:2]
     return vertices, orient_tets(tets, vertices)
 
 

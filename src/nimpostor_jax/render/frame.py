@@ -77,6 +77,7 @@ def render_frame(
     32nd of the tolerance, or by half of it after a change within it. The last change is returned as `error`;
     it is larger where 1 / `MAX_REFINEMENT` of the steps did not suffice. One small change is no proof: two
     coarse quadratures may miss the same detail. Samples below `min_weight` are left out all the same.
+    Raises ValueError for a tolerance that is not positive.
     """
     height, width = camera.height, camera.width
     if tolerance is not None:
