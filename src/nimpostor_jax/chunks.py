@@ -121,17 +121,17 @@ def _map_used_forward(
     function: Callable, chunk: int, shared: Any, items: Any, num_used: Any
 ) -> tuple[Any, tuple]:
     values = custom_vjp_primal_tree_values((shared, items, num_used))
-    return _map_used(function, chunk, *values), (*split_moving((shared, items)), values[2])
+    return _map_used(function, chunk, *values), (*_split_moving((shared, items)), values[2])
 
 
 def _map_used_backward(function: Callable, chunk: int, residuals: tuple, cotangents: Any) -> tuple:
     (d_shared, d_items), (fixed, fixed_items), num_used = residuals
-    cotangents = materialize(cotangents)
+    cotangents = _materialize(cotangents)
 
     def body(start: Array, sums: tuple) -> tuple:
         part, fixed_part = take((d_items, fixed_items), start, chunk)
         _, pull = jax.vjp(
-            lambda s, p: function(join_moving(s, fixed), join_moving(p, fixed_part)), d_shared, part
+            lambda s, p: function(_join_moving(s, fixed), _join_moving(p, fixed_part)), d_shared, part
         )
         of_shared, of_part = pull(take(cotangents, start, chunk))
         return jax.tree.map(jnp.add, sums[0], of_shared), put(sums[1], start, of_part)
@@ -144,7 +144,7 @@ def _map_used_backward(function: Callable, chunk: int, residuals: tuple, cotange
 _map_used.defvjp(_map_used_forward, _map_used_backward, symbolic_zeros=True)
 
 
-def materialize(cotangents: Any) -> Any:
+def _materialize(cotangents: Any) -> Any:
     """Cotangents of a custom VJP with arrays in the place of symbolic zeros."""
     return jax.tree.map(
         lambda x: jnp.zeros(x.shape, x.dtype) if isinstance(x, SymbolicZero) else x,
@@ -153,7 +153,7 @@ def materialize(cotangents: Any) -> Any:
     )
 
 
-def split_moving(arguments: Any) -> tuple[Any, Any]:
+def _split_moving(arguments: Any) -> tuple[Any, Any]:
     """A custom VJP's arguments: leaves that are differentiated, and others; None in each other's place."""
 
     def part(keep: bool) -> Any:
@@ -166,6 +166,6 @@ def split_moving(arguments: Any) -> tuple[Any, Any]:
     return part(True), part(False)
 
 
-def join_moving(moving: Any, fixed: Any) -> Any:
-    """What `split_moving` split."""
+def _join_moving(moving: Any, fixed: Any) -> Any:
+    """What `_split_moving` split."""
     return jax.tree.map(lambda x, y: y if x is None else x, moving, fixed, is_leaf=lambda x: x is None)

@@ -241,7 +241,7 @@ class TrainConfig:
     warmup_steps: int = 50
     background: Background = "random"
     cells_per_edge: int = 16  # of the occupancy grid in each tet; 0: no sample is left out
-    forget_after: int = 500  # steps after which a cell that no ray sees counts as empty
+    forget_rays: int = 2_000_000  # rays after which a cell that none has seen counts as empty
     seed: int = 0
     log_every: int = 50
     eval_every: int = 0  # 0: only at the end
@@ -260,10 +260,15 @@ class TrainConfig:
             f"one of {typing.get_args(Background)}",
         )
         _require(0 <= self.cells_per_edge <= 64, self, "cells_per_edge", "in [0, 64]")
-        _require(self.forget_after >= 1, self, "forget_after", ">= 1")
+        _require(self.forget_rays >= 1, self, "forget_rays", ">= 1")
         _require(self.log_every >= 1, self, "log_every", ">= 1")
         _require(self.eval_every >= 0, self, "eval_every", ">= 0")
         _require(self.checkpoint_every >= 1, self, "checkpoint_every", ">= 1")
+
+    @property
+    def forget_after(self) -> int:
+        """`forget_rays` in steps."""
+        return -(-self.forget_rays // self.rays_per_batch)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

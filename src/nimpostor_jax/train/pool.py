@@ -1,6 +1,5 @@
 """The pixels to train on: those of all views whose rays hit the cage, as one pool to draw batches from."""
 
-import dataclasses
 from functools import partial
 
 import jax
@@ -52,7 +51,7 @@ def build_pool(
         indices.append(np.flatnonzero(hits))
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
-        entries.append(jax.tree.map(lambda x, kept=rank[indices[-1]]: x[kept], found))
+        entries.append(jax.tree.map(lambda x, kept=rank[indices[-1]]: np.asarray(x)[kept], found))
         views.append(np.full(len(indices[-1]), view))
     if not sum(map(len, indices)):
         raise ValueError(
@@ -73,13 +72,14 @@ def build_pool(
 
 
 def _concatenated(parts: list[Entries]) -> Entries:
+    """Entries of all views, in the slots that the fullest needs; on the host, since shapes differ by view."""
     slots = max(part.holds.shape[1] for part in parts)
-
-    def padded(part: Entries) -> Entries:
-        padding = ((0, 0), (0, slots - part.holds.shape[1]))
-        return dataclasses.replace(part, holds=jnp.pad(part.holds, padding, constant_values=-1))
-
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *map(padded, parts))
+    holds = [np.pad(p.holds, ((0, 0), (0, slots - p.holds.shape[1])), constant_values=-1) for p in parts]
+    return Entries(
+        holds=jnp.asarray(np.concatenate(holds)),
+        overflow=jnp.asarray(np.concatenate([part.overflow for part in parts])),
+        unsure=jnp.asarray(np.concatenate([part.unsure for part in parts])),
+    )
 
 
 def _one(cameras: Camera, view: int) -> Camera:

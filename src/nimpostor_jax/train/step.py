@@ -21,7 +21,7 @@ from nimpostor_jax.types import NeuralImpostor, Rays
 Parameters = dict[str, Any]
 Metrics = dict[str, Array]
 
-MAX_CELLS = 1 << 21  # of all tets: 8 MiB of `last_seen`
+MAX_CELLS = 1 << 19  # of all tets: more would see too few rays before they are forgotten
 
 
 @struct.dataclass
@@ -127,7 +127,7 @@ def train_step(
     *,
     config: RenderConfig,
     optimizer: optax.GradientTransformation,
-    forget_after: int = TrainConfig.forget_after,
+    forget_after: int = TrainConfig().forget_after,
     gradient: Callable[..., tuple[Parameters, Metrics]] = loss_gradient,
 ) -> tuple[TrainState, Metrics]:
     """One optimiser step at learning rate `rate`.
