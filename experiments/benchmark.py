@@ -37,7 +37,7 @@ from nimpostor_jax.pipeline.evaluate import camera_of, write_json
 from nimpostor_jax.pipeline.prepare import Scene, prepare, use_all_cores
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.frame import frame_config, render_frame
-from nimpostor_jax.render.sampling import sample_segments
+from nimpostor_jax.render.sampling import plan_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
 from nimpostor_jax.train.pool import draw_batch
@@ -198,7 +198,7 @@ def count_samples(scene: Scene, size: int) -> int:
     def counts() -> jax.Array:
         rays = to_local(mesh, batch.rays)
         segments = locate_segments(mesh, rays, traverse(march_tables(mesh), rays, scene.render.march))
-        return sample_segments(segments, scene.render.sampler, "barycentric").num_used
+        return plan_samples(segments, scene.render.sampler, "barycentric").num_used
 
     return int(counts())
 

@@ -48,7 +48,7 @@ from nimpostor_jax.gin_flags import run_cli
 from nimpostor_jax.io.mesh_files import load_tets
 from nimpostor_jax.pipeline.evaluate import write_json
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.composite import sample_weights
+from nimpostor_jax.render.composite import sample_weights, sum_by_ray
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import Crossings, march_tables, traverse
 from nimpostor_jax.types import Rays, TetMesh, TetSegments
@@ -136,9 +136,8 @@ def stress(case: Case, dtype: str, rounds: int, seed: Any) -> Row:
         few = np.arange(min(COLORED, len(error)))
         sigma = DENSITIES[turn % len(DENSITIES)]
         some_rays = jax.tree.map(lambda x, few=few: x[few], rays)
-        some_segments, some_crossings = jax.tree.map(
-            lambda x, few=few: x[:, few] if x.ndim > 1 else x[few], (segments, crossings)
-        )
+        some_crossings = jax.tree.map(lambda x, few=few: x[..., few], crossings)
+        some_segments = locate(mesh, some_rays, some_crossings, near)
         gradients = color_gradients(mesh, some_rays, some_crossings, near, sigma)
         row["nonfinite"] += count_nonfinite(gradients)
         if not folded:
@@ -184,10 +183,14 @@ def march_rays(
     return crossings, locate_segments(mesh, rays, crossings, near), walked
 
 
+locate = jax.jit(locate_segments)
+
+
 @jax.jit
 def lengths(segments: TetSegments) -> jax.Array:
     """Length of all segments of each ray, [R], summed in float64."""
-    return jnp.sum(segments.t_exit.astype(jnp.float64) - segments.t_enter, axis=0)
+    length = segments.t_exit.astype(jnp.float64) - segments.t_enter
+    return jax.ops.segment_sum(length, segments.rays, segments.overflow.shape[0])
 
 
 def palette(points: Any) -> Any:
@@ -210,9 +213,9 @@ def segment_colors(mesh: TetMesh, segments: TetSegments, sigma: Any) -> jax.Arra
     thin, thick = jnp.minimum(depth, 1e-2), jnp.maximum(depth, 1e-2)
     place = 1 / thick - 1 / jnp.expm1(jnp.minimum(thick, 50))  # beyond, the second term is below rounding
     place = jnp.where(depth > 1e-2, place, 0.5 - thin / 12 + thin**3 / 720)[..., None]
-    rays = jnp.broadcast_to(jnp.arange(depth.shape[1], dtype=jnp.int32)[:, None], depth.T.shape)
-    weights = sample_weights(depth.T.reshape(-1), rays.reshape(-1)).reshape(rays.shape).T[..., None]
-    return jnp.sum(weights * jnp.concatenate([first + place * (last - first), jnp.ones_like(place)], -1), 0)
+    values = jnp.concatenate([first + place * (last - first), jnp.ones_like(place)], axis=-1)
+    weights, count = sample_weights(depth, segments.rays), jnp.int32(len(depth))
+    return sum_by_ray(weights, values, segments.rays, segments.overflow.shape[0], count)
 
 
 @jax.jit
@@ -238,8 +241,15 @@ def count_nonfinite(tree: Any) -> int:
 def overlapping(segments: TetSegments, tolerance: float) -> jax.Array:
     """Rays on which a segment of some length begins before an earlier one has ended."""
     long = segments.t_exit - segments.t_enter > tolerance
-    before = jax.lax.cummax(jnp.where(long, segments.t_exit, -jnp.inf), axis=0)[:-1]
-    return jnp.any(long[1:] & (segments.t_enter[1:] < before - tolerance), axis=0)
+    ends = jnp.where(long, segments.t_exit, -jnp.inf)
+    goes_on = jnp.pad(segments.rays[1:] == segments.rays[:-1], (1, 0))
+
+    def join(left: tuple, right: tuple) -> tuple:
+        return jnp.where(right[1], jnp.maximum(left[0], right[0]), right[0]), left[1] & right[1]
+
+    furthest, _ = jax.lax.associative_scan(join, (ends, goes_on))
+    again = long[1:] & goes_on[1:] & (segments.t_enter[1:] < furthest[:-1] - tolerance)
+    return jax.ops.segment_max(again, segments.rays[1:], segments.overflow.shape[0])
 
 
 def chord_errors(

@@ -1,6 +1,5 @@
 """Rays for the tests of the renderer, as NumPy float64: (origins [R,3], directions [R,3])."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -84,6 +83,17 @@ DEGENERATE = {
 }  # fmt: skip
 
 
-def by_ray(tree):
-    """Segments or crossings with rays as the first axis and slots as the second, and back."""
-    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1) if x.ndim > 1 else x, tree)
+def by_ray(segments):
+    """Segments with rays as the first axis and slots as the second, empty ones last; differentiable."""
+    num_rays = segments.overflow.shape[0]
+    slots = segments.rays.shape[0] // max(num_rays, 1)
+    counts = jnp.zeros(num_rays, int).at[segments.rays].add(1)
+    slot = jnp.arange(segments.rays.shape[0]) - (jnp.cumsum(counts) - counts)[segments.rays]
+
+    def spread(values, fill):
+        empty = jnp.full((num_rays, slots, *values.shape[1:]), fill, values.dtype)
+        return empty.at[segments.rays, slot].set(values, mode="drop")
+
+    names = ("rays", "t_enter", "t_exit", "lambda_enter", "lambda_exit")
+    dense = {name: spread(getattr(segments, name), 0) for name in names}
+    return segments.replace(tet_ids=spread(segments.tet_ids, -1), **dense)

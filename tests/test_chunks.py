@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from nimpostor_jax.chunks import map_used
+from nimpostor_jax import chunks
+from nimpostor_jax.chunks import map_used, pack_where, running
 
 
 def scale_and_pick(shared, items):
@@ -59,3 +60,21 @@ def test_the_number_used_does_not_recompile(rng):
     results = [np.asarray(mapped(jnp.zeros(12), used)) for used in (0, 3, 12)]
     assert [int(r.sum()) for r in results] == [0, 4, 12]
     assert len(traces) == 1
+
+
+@pytest.mark.parametrize("count", [1, 63, 64, 65, 64 * 64 + 1, 20_000])
+def test_running_folds_follow_numpy(count, rng):
+    values = rng.integers(-50, 50, count).astype(np.int32)
+    assert_array_equal(running(jnp.add, values, 0), np.cumsum(values))
+    assert_array_equal(running(jnp.maximum, values, -100), np.maximum.accumulate(values))
+
+
+@pytest.mark.parametrize("count, used", [(0, 0), (10, 10), (10, 7), (10, 0), (9, 9), (3, 2)])
+def test_items_are_packed_across_chunks(count, used, rng, monkeypatch):
+    monkeypatch.setattr(chunks, "CPU_CHUNK", 4)
+    values = jnp.asarray(rng.normal(size=count), jnp.float32)
+    for least in (-9.0, 0.0, 9.0):
+        found, kept = pack_where(lambda bound, x: x >= bound, jnp.float32(least), values, jnp.int32(used))
+        assert_array_equal(found[:kept], np.flatnonzero(np.asarray(values)[:used] >= least))
+        assert found.shape == (count,)
+        assert np.all((np.asarray(found) >= 0) & (np.asarray(found) < max(count, 1)))

@@ -123,6 +123,7 @@ class MarchConfig:
     """Fixed sizes of the tet traversal (Sec. 3.4, Fig. 4). A change recompiles."""
 
     max_tets_per_ray: int = 64  # K
+    capacity_per_ray: int | None = None  # mean tets a ray in the packed buffer; None: K
     max_entries_per_ray: int = 4  # times that a ray enters the cage from outside
     tile_size: int | None = (
         None  # rays marched together; None: 256 on CPU, the whole batch elsewhere
@@ -130,6 +131,12 @@ class MarchConfig:
 
     def __post_init__(self) -> None:
         _require(self.max_tets_per_ray >= 1, self, "max_tets_per_ray", ">= 1")
+        _require(
+            self.capacity_per_ray is None or 1 <= self.capacity_per_ray <= self.max_tets_per_ray,
+            self,
+            "capacity_per_ray",
+            "None or in [1, max_tets_per_ray]",
+        )
         _require(self.max_entries_per_ray >= 1, self, "max_entries_per_ray", ">= 1")
         _require(self.tile_size is None or self.tile_size >= 1, self, "tile_size", "None or >= 1")
 

@@ -1,6 +1,6 @@
 """Records that cross stage boundaries: pytrees of arrays, built and validated on the host.
 
-Axes: V vertices, T tets, R rays, K tet slots per ray, S samples per ray, L levels, F features per level.
+Axes: V vertices, T tets, R rays, N segments, S samples per ray, L levels, F features per level.
 Units: `TetMesh.vertices` are in the cage's own frame (centre 0, half diagonal 1); `Rays` are in world units
 until `render.camera.to_local`. Barycentric coordinates and weights have no unit.
 
@@ -62,16 +62,17 @@ class Rays:
 
 @struct.dataclass
 class TetSegments:
-    """The tets that each ray crosses, in order along the ray (Fig. 4). Slots may be empty anywhere.
+    """The tets that rays cross (Fig. 4), packed: by ray, then along each ray. Slots may be empty anywhere.
 
     Barycentric coordinates are affine along a ray, so the two ends give every point between (Eq. 3).
     """
 
-    tet_ids: Int[Array, "K R"]  # -1 marks an empty slot
-    t_enter: Float[Array, "K R"]
-    t_exit: Float[Array, "K R"]  # never before t_enter
-    lambda_enter: Float[Array, "K R 4"]
-    lambda_exit: Float[Array, "K R 4"]
+    rays: Int[Array, " N"]  # ascending, in empty slots too
+    tet_ids: Int[Array, " N"]  # -1 marks an empty slot
+    t_enter: Float[Array, " N"]
+    t_exit: Float[Array, " N"]  # never before t_enter
+    lambda_enter: Float[Array, "N 4"]
+    lambda_exit: Float[Array, "N 4"]
     overflow: Bool[Array, " R"]  # more tets or entries than slots: the tail is missing
 
 

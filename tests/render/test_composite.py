@@ -9,7 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from nimpostor_jax.render.composite import ROW, blend_background, sample_weights, sum_before, transmittance
+from nimpostor_jax import chunks
+from nimpostor_jax.chunks import ROW
+from nimpostor_jax.render.composite import (
+    blend_background,
+    sample_weights,
+    sum_before,
+    sum_by_ray,
+    transmittance,
+)
 
 
 @jax.jit
@@ -63,6 +71,40 @@ def test_sums_before_follow_the_loop_across_rows(counts, rng):
         after = np.cumsum(mix[mine][::-1], dtype=np.float64)[::-1] - mix[mine]
         assert_allclose(sums[mine], before, rtol=1e-5, atol=1e-6)  # up to 300 float32 additions
         assert_allclose(gradient[mine], after, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("used", [0, 1, 2 * ROW, 5 * ROW + 7])
+def test_sums_before_follow_the_loop_across_chunks(used, rng, monkeypatch):
+    monkeypatch.setattr(chunks, "CPU_CHUNK", 2 * ROW)
+    rays = packed_rays([40, 3 * ROW, 1, 2 * ROW, 200])[: 5 * ROW + 7]
+    values, mix = rng.uniform(0, 1, (2, len(rays))).astype(np.float32)
+    sums = sum_before(values, rays, jnp.int32(used))
+    gradient = jax.grad(lambda v: jnp.sum(mix * sum_before(v, rays, jnp.int32(used))))(values)
+    for ray in range(5):
+        mine = np.flatnonzero(rays[:used] == ray)
+        before = np.cumsum(values[mine], dtype=np.float64) - values[mine]
+        after = np.cumsum(mix[mine][::-1], dtype=np.float64)[::-1] - mix[mine]
+        assert_allclose(sums[mine], before, rtol=1e-5, atol=1e-6)
+        assert_allclose(gradient[mine], after, rtol=1e-5, atol=1e-6)
+
+
+def test_sums_by_ray_and_their_gradients(rng, x64, monkeypatch):
+    """The first `used` samples only, whatever stands behind them."""
+    monkeypatch.setattr(chunks, "CPU_CHUNK", 4)
+    rays, used = packed_rays([3, 0, 5, 4]), 10
+    weights, values = jnp.asarray(rng.normal(size=12)), jnp.asarray(rng.normal(size=(12, 2)))
+    mix = rng.normal(size=(4, 2))
+
+    def plain(weights, values):
+        return jax.ops.segment_sum((weights[:, None] * values)[:used], rays[:used], 4)
+
+    def ours(weights, values):
+        return sum_by_ray(weights, values, jnp.asarray(rays), 4, jnp.int32(used))
+
+    assert_allclose(ours(weights, values), plain(weights, values), rtol=1e-12)
+    of = (jax.grad(lambda *a, f=f: jnp.sum(mix * f(*a)), (0, 1)) for f in (ours, plain))
+    for mine, theirs in zip(*(gradient(weights, values) for gradient in of), strict=True):
+        assert_allclose(mine, theirs, rtol=1e-12)
 
 
 def test_a_thin_ray_behind_a_dense_one_keeps_its_digits():

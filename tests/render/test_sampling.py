@@ -15,9 +15,9 @@ from rays import as_rays, by_ray, generic, missing
 
 from nimpostor_jax.config import MarchConfig, SamplerConfig
 from nimpostor_jax.render.sampling import (
-    sample_segments,
+    place_samples,
+    plan_samples,
     segment_measure,
-    select_samples,
     step_boundaries,
 )
 from nimpostor_jax.render.segments import locate_segments
@@ -42,9 +42,18 @@ def scene(name="nonconvex"):
     return mesh, (origins, directions), jax.jit(locate_segments)(mesh, rays, crossings)
 
 
-@functools.partial(jax.jit, static_argnames=("config", "density_measure"))
-def sample(segments, config, density_measure, jitter=None):
-    return sample_segments(segments, config, density_measure, jitter)
+def sample_all(segments, config, density_measure, jitter=None):
+    plan = plan_samples(segments, config, density_measure, jitter)
+    return place_samples(plan, jnp.arange(len(plan.owners)), plan.num_used)
+
+
+sample = jax.jit(sample_all, static_argnames=("config", "density_measure"))
+
+
+def ray_measure(segments, measure):
+    """Each ray's extent."""
+    extents = np.asarray(segment_measure(segments, measure))
+    return np.bincount(segments.rays, extents, minlength=len(segments.overflow))
 
 
 def segments_of(*rays, slots=4):
@@ -58,15 +67,15 @@ def segments_of(*rays, slots=4):
             if tet >= 0:
                 enter[r, k], exit_[r, k] = low, high
                 lambdas[0, r, k, 0] = lambdas[1, r, k, 1] = 1
-    segments = TetSegments(
-        tet_ids=jnp.asarray(ids, jnp.int32),
-        t_enter=jnp.asarray(enter, jnp.float32),
-        t_exit=jnp.asarray(exit_, jnp.float32),
-        lambda_enter=jnp.asarray(lambdas[0], jnp.float32),
-        lambda_exit=jnp.asarray(lambdas[1], jnp.float32),
+    return TetSegments(
+        rays=jnp.repeat(jnp.arange(len(rays), dtype=jnp.int32), slots),
+        tet_ids=jnp.asarray(ids.ravel(), jnp.int32),
+        t_enter=jnp.asarray(enter.ravel(), jnp.float32),
+        t_exit=jnp.asarray(exit_.ravel(), jnp.float32),
+        lambda_enter=jnp.asarray(lambdas[0].reshape(-1, 4), jnp.float32),
+        lambda_exit=jnp.asarray(lambdas[1].reshape(-1, 4), jnp.float32),
         overflow=jnp.zeros(len(rays), bool),
     )
-    return by_ray(segments)
 
 
 def used(samples):
@@ -109,7 +118,7 @@ def test_intervals_sum_to_the_rays_measure(measure, cone):
     samples = sample(segments, config, measure)
     points = used(samples)
     total = np.bincount(points["rays"], points["deltas"], minlength=COUNT)
-    assert_allclose(total, np.sum(segment_measure(segments, measure), axis=0), rtol=1e-5)
+    assert_allclose(total, ray_measure(segments, measure), rtol=1e-5)
     assert np.all(points["deltas"] > 0)
 
 
@@ -119,11 +128,10 @@ def test_measures_match_the_oracle():
         expected = oracles.ray_segments(*local_vertices(mesh), origin, direction)
         bary = sum(np.abs(s[4] - s[3]).sum() for s in expected)
         length = sum(s[1] - s[0] for s in expected)
-        assert_allclose(np.sum(segment_measure(segments, "barycentric")[:, ray]), bary, atol=1e-4)
-        assert_allclose(np.sum(segment_measure(segments, "euclidean")[:, ray]), length, atol=1e-4)
-        assert np.sum(segment_measure(segments, "alpha")[:, ray]) == np.sum(
-            np.asarray(segments.tet_ids)[:, ray] >= 0
-        )
+        assert_allclose(ray_measure(segments, "barycentric")[ray], bary, atol=1e-4)
+        assert_allclose(ray_measure(segments, "euclidean")[ray], length, atol=1e-4)
+        mine = np.asarray(segments.rays) == ray
+        assert ray_measure(segments, "alpha")[ray] == np.sum(np.asarray(segments.tet_ids)[mine] >= 0)
 
 
 def test_a_mixed_density_measure_converges_to_the_rays_measure():
@@ -133,7 +141,7 @@ def test_a_mixed_density_measure_converges_to_the_rays_measure():
     points = used(sample(segments, config, "euclidean"))
     total = np.bincount(points["rays"], points["deltas"], minlength=COUNT)
     # steps that straddle two tets are attributed to one: an error of the order of the step per tet
-    assert_allclose(total, np.sum(segment_measure(segments, "euclidean"), axis=0), rtol=0.02)
+    assert_allclose(total, ray_measure(segments, "euclidean"), rtol=0.02)
 
 
 def test_equal_steps_no_longer_than_asked_for_and_samples_in_their_middle():
@@ -226,7 +234,10 @@ def test_jitter_does_not_depend_on_the_batch():
     jitter = jnp.linspace(0, 0.99, COUNT)
     whole = used(sample(segments, CONFIG, "barycentric", jitter))
     order = np.random.default_rng(0).permutation(COUNT)[: COUNT // 2]
-    part = jax.tree.map(lambda x: x[:, order] if x.ndim > 1 else x[order], segments)
+    slots = len(segments.rays) // COUNT
+    dense = jax.tree.map(lambda x: x[order], by_ray(segments))
+    part = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]) if x.ndim > 1 else x, dense)
+    part = part.replace(rays=jnp.repeat(jnp.arange(len(order)), slots))
     samples = used(sample(part, CONFIG, "barycentric", jitter[order]))
     for position, ray in enumerate(order):
         assert_array_equal(samples["t"][samples["rays"] == position], whole["t"][whole["rays"] == ray])
@@ -238,17 +249,19 @@ def test_rays_without_tets_have_no_samples():
     assert np.all(np.asarray(samples.deltas[4:]) == 0)
 
 
-def test_selected_samples_keep_their_order(rng):
+def test_some_of_the_samples_are_placed_as_all_of_them(rng):
     _, _, segments = scene()
     config = dataclasses.replace(CONFIG, capacity_per_ray=16, max_samples_per_ray=48)
+    plan = plan_samples(segments, config, "barycentric")
     samples = sample(segments, config, "barycentric")
-    keep = jnp.asarray(rng.uniform(size=samples.t.shape) < 0.4)
-    selected = jax.jit(select_samples)(samples, keep)
-    expected = np.flatnonzero(np.asarray(keep)[: int(samples.num_used)])
-    assert 0 < len(expected) < int(samples.num_used) < len(keep)
+    count = int(plan.num_used)
+    expected = np.flatnonzero(rng.uniform(size=count) < 0.4)
+    chosen = jnp.asarray(np.resize(expected, len(plan.owners)), jnp.int32)
+    selected = jax.jit(place_samples)(plan, chosen, len(expected))
+    assert 0 < len(expected) < count < len(plan.owners)
     assert int(selected.num_used) == len(expected)
     for name, kept in used(selected).items():
-        assert_array_equal(kept, np.asarray(getattr(samples, name))[expected])
+        assert_allclose(kept, np.asarray(getattr(samples, name))[expected], rtol=1e-6)  # fused otherwise
     assert not np.any(np.asarray(selected.deltas)[len(expected) :])
 
 
@@ -269,12 +282,12 @@ def test_positions_are_differentiable(x64, rng):
     segments = jax.tree.map(lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, segments)
     mix = jnp.asarray(rng.normal(size=(COUNT * 64, 4)))
     nudge = jnp.asarray(rng.normal(size=segments.lambda_exit.shape))
-    nonempty = segments.tet_ids[..., None] >= 0
+    nonempty = segments.tet_ids[:, None] >= 0
 
     @jax.jit
     def function(x):
         moved = segments.replace(lambda_exit=segments.lambda_exit + jnp.where(nonempty, x * nudge, 0))
-        samples = sample_segments(moved, CONFIG, "barycentric")
+        samples = sample_all(moved, CONFIG, "barycentric")
         return jnp.sum(mix * samples.lambdas * samples.deltas[:, None]) + jnp.sum(mix[:, 0] * samples.t)
 
     expected = oracles.directional_difference(function, jnp.zeros(()), 1.0, 1e-6)

@@ -255,7 +255,7 @@ def test_results_do_not_depend_on_the_tile(tile, rng):
 def test_no_rays_give_no_segments():
     mesh = tet_mesh("cube")
     segments = walk(mesh, as_rays((np.zeros((0, 3)), np.zeros((0, 3)))))
-    assert segments.t_enter.shape == (0, CONFIG.max_tets_per_ray)
+    assert segments.t_enter.shape[0] == 0
 
 
 def test_far_away_rays_find_a_small_cage(rng):

@@ -45,17 +45,19 @@ def encode(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""] | int | None = None,
+    known: Float[Array, "M L*F"] | None = None,
 ) -> Float[Array, "M L*F"]:
     """Features f_p of points given by tet and barycentric coordinates, all levels concatenated (Eq. 6).
 
     Differentiable in the tables and, between grid nodes, in the coordinates, in reverse mode. Where only the
-    first `num_used` points matter, no more than their chunks are computed; the rest is 0.
+    first `num_used` points matter, no more than their chunks are computed; the rest is 0. Where the features
+    are `known` from an earlier call, they are not computed again but given their derivatives.
     """
     num_points = tet_ids.shape[0]
     chunk = default_chunk(num_points)
     used = jnp.asarray(num_points if num_used is None else num_used, jnp.int32)
-    tet_ids, lambdas = pad_items((tet_ids, lambdas), chunk)
-    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used)[:num_points]
+    tet_ids, lambdas, known = pad_items((tet_ids, lambdas, known), chunk)
+    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used, known)[:num_points]
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -67,11 +69,14 @@ def _encode(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""],
+    known: Float[Array, "M L*F"] | None,
 ) -> Float[Array, "M L*F"]:
     """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best.
 
     All chunks of a level come before the next level: its entries come into the cache once, not per chunk.
     """
+    if known is not None:
+        return known
     points = _points(config, chunk, layout, tet_ids, lambdas, num_used)
 
     def add_level(level: Array, corners: _CornersOf, address: _AddressOf, out: Array) -> Array:
@@ -93,16 +98,16 @@ def _encode_forward(config: EncodingConfig, chunk: int, *primals: Any) -> tuple[
     """Keeps which gradients are asked for, as () or None: static, since an empty tuple holds no array."""
     arguments = jax.tree.map(lambda p: p.value, primals)
     wanted = tuple(() if primals[i].perturbed else None for i in (0, 3))
-    return _encode(config, chunk, *arguments), (arguments, wanted)
+    return _encode(config, chunk, *arguments), ((*arguments[:5], None), wanted)
 
 
 def _encode_backward(
     config: EncodingConfig, chunk: int, residuals: tuple, cotangent: Float[Array, "M L*F"] | SymbolicZero
 ) -> tuple:
     """Scatters into the tables, and gathers for the coordinates, only where that gradient is used."""
-    (features, layout, tet_ids, lambdas, num_used), (of_features, of_lambdas) = residuals
+    (features, layout, tet_ids, lambdas, num_used, _), (of_features, of_lambdas) = residuals
     if isinstance(cotangent, SymbolicZero):
-        return (None,) * 5
+        return (None,) * 6
     points = _points(config, chunk, layout, tet_ids, lambdas, num_used)
     d_levels = cotangent.reshape(len(tet_ids), config.num_levels, -1)
 
@@ -134,7 +139,7 @@ def _encode_backward(
     d_coordinates = None if of_lambdas is None else jax.tree.map(jnp.zeros_like, points.coordinates)
     d_features, d_coordinates = _for_levels(config, layout, add_level, (d_features, d_coordinates))
     if of_lambdas is None:
-        return d_features, None, None, None, None
+        return d_features, None, None, None, None, None
 
     def pull_chunk(start: Array, d_lambdas: Array) -> Array:
         canonical = partial(_canonical, layout, config, take(tet_ids, start, chunk))
@@ -142,7 +147,7 @@ def _encode_backward(
         return put(d_lambdas, start, *pull(take(d_coordinates, start, chunk)))
 
     d_lambdas = for_chunks(num_used, chunk, pull_chunk, jnp.zeros_like(lambdas))
-    return d_features, None, None, d_lambdas, None
+    return d_features, None, None, d_lambdas, None, None
 
 
 _encode.defvjp(_encode_forward, _encode_backward, symbolic_zeros=True)

@@ -32,9 +32,13 @@ def features(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""] | None = None,
+    known: Float[Array, "M C"] | None = None,
 ) -> Float[Array, "M C"]:
-    """Position features f_p (Eq. 6), of the first `num_used` points where given."""
-    return encode(impostor.tables, impostor.config.encoding, tet_ids, lambdas, num_used)
+    """Position features f_p (Eq. 6), of the first `num_used` points where given.
+
+    Features that are `known` are only given their derivatives.
+    """
+    return encode(impostor.tables, impostor.config.encoding, tet_ids, lambdas, num_used, known)
 
 
 def density(

@@ -52,6 +52,7 @@ def _keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # another C library
         return
+    mallopt(ctypes.c_int(-8), ctypes.c_int(1))  # M_ARENA_MAX
     mallopt(ctypes.c_int(-4), ctypes.c_int(0))  # M_MMAP_MAX
     mallopt(ctypes.c_int(-1), ctypes.c_int(2**31 - 1))  # M_TRIM_THRESHOLD
 

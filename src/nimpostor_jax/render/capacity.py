@@ -48,12 +48,14 @@ def all_entries(
 @partial(jax.jit, static_argnames="config")
 def _demand(
     mesh: TetMesh, tables: MarchTables, rays: Rays, config: RenderConfig
-) -> tuple[Int[Array, ""], Bool[Array, ""], Float[Array, " R"]]:
+) -> tuple[Int[Array, " R"], Bool[Array, ""], Float[Array, " R"]]:
+    """Tets that each ray crosses, whether any did not fit, and each ray's measure."""
     local = to_local(mesh, rays)
     crossings = traverse(tables, local, config.march)
     segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
-    total = jnp.sum(segment_measure(segments, config.sampler.measure), axis=0)
-    return jnp.max(jnp.sum(crossings.codes >= 0, axis=0)), jnp.any(crossings.overflow), total
+    measure = segment_measure(segments, config.sampler.measure)
+    total = jax.ops.segment_sum(measure, segments.rays, rays.origins.shape[0])
+    return jnp.sum(crossings.codes >= 0, axis=0), jnp.any(crossings.overflow), total
 
 
 def fit_capacities(
@@ -64,12 +66,12 @@ def fit_capacities(
     Slots are rounded up to multiples of 8; `max_samples_per_ray` of the given config stays the limit.
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
-    most_tets, overflow, total = _demand(mesh, tables, rays, config)
+    tets, overflow, total = _demand(mesh, tables, rays, config)
     for _ in range(MAX_GROWTH):
         if not overflow:
             break
         config = grow_march(config)
-        most_tets, overflow, total = _demand(mesh, tables, rays, config)
+        tets, overflow, total = _demand(mesh, tables, rays, config)
     if overflow:
         raise ValueError(
             f"a ray crosses more than {config.march.max_tets_per_ray} tets or enters the cage more than "
@@ -79,21 +81,31 @@ def fit_capacities(
     boundaries = step_boundaries(config.sampler)
     wanted = np.clip(np.searchsorted(boundaries, np.asarray(total) * (1 - 1e-5)), 0, len(boundaries) - 1)
     most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
-    # Rays share the buffer, so that its mean load fluctuates much less than a single ray's.
-    mean = min(most, max(1, int(np.ceil((1 + (margin - 1) / 2) * wanted.mean()))))
-    march = dataclasses.replace(config.march, max_tets_per_ray=_round_up(margin * int(most_tets)))
-    sampler = dataclasses.replace(config.sampler, max_samples_per_ray=most, capacity_per_ray=mean)
+    march = dataclasses.replace(
+        config.march,
+        max_tets_per_ray=_round_up(margin * int(jnp.max(tets))),
+        capacity_per_ray=_mean(np.asarray(tets), margin),
+    )
+    sampler = dataclasses.replace(
+        config.sampler, max_samples_per_ray=most, capacity_per_ray=min(most, _mean(wanted, margin))
+    )
     return dataclasses.replace(config, march=march, sampler=sampler)
 
 
 def grow_march(config: RenderConfig) -> RenderConfig:
-    """Twice the tet slots and entries."""
+    """Twice the tet slots and entries, and room for rays that need them all."""
     march = dataclasses.replace(
         config.march,
+        capacity_per_ray=None,
         max_tets_per_ray=2 * config.march.max_tets_per_ray,
         max_entries_per_ray=2 * config.march.max_entries_per_ray,
     )
     return dataclasses.replace(config, march=march)
+
+
+def _mean(needed: np.ndarray, margin: float) -> int:
+    """Room for a mean ray: rays share a buffer, so that its load fluctuates less than a single ray's."""
+    return max(1, int(np.ceil((1 + (margin - 1) / 2) * needed.mean())))
 
 
 def _round_up(value: float) -> int:

@@ -4,49 +4,89 @@ Axes: M samples, ordered by ray and along each ray. The optical depth of an inte
 of the density measure, times its length in that measure.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-ROW = 64  # samples summed one after another, in all rows at once
+from nimpostor_jax.chunks import ROW, default_chunk, for_chunks, map_used, pad_items, put, running, take
 
 
-def transmittance(optical_depth: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array, " M"]:
+def transmittance(
+    optical_depth: Float[Array, " M"], rays: Int[Array, " M"], num_used: Int[Array, ""] | None = None
+) -> Float[Array, " M"]:
     """Light that reaches each interval's start: exp of minus the optical depth before it on its ray."""
-    return jnp.exp(-sum_before(optical_depth, rays))
+    return jnp.exp(-sum_before(optical_depth, rays, num_used))
 
 
-def sample_weights(optical_depth: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array, " M"]:
+def sample_weights(
+    optical_depth: Float[Array, " M"], rays: Int[Array, " M"], num_used: Int[Array, ""] | None = None
+) -> Float[Array, " M"]:
     """Share of the ray's light that each interval contributes: T_i (1 - exp(-sigma_i delta_i))."""
-    return transmittance(optical_depth, rays) * -jnp.expm1(-optical_depth)
+    return transmittance(optical_depth, rays, num_used) * -jnp.expm1(-optical_depth)
+
+
+def sum_before(
+    values: Float[Array, " M"], rays: Int[Array, " M"], num_used: Int[Array, ""] | None = None
+) -> Float[Array, " M"]:
+    """Sum of the earlier values with the same ray; equal rays stand together. Differentiable in reverse mode.
+
+    Each ray is summed on its own: differences of one running sum over all rays would cancel. Where only the
+    first `num_used` values matter, no more than their chunks are summed; the rest is 0.
+    """
+    count = values.shape[0]
+    used = jnp.asarray(count if num_used is None else num_used, jnp.int32)
+    return _sum_before(values, rays, used) if count else values
 
 
 @jax.custom_vjp
-def sum_before(values: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array, " M"]:
-    """Sum of the earlier values with the same ray; equal rays stand together. Differentiable in reverse mode.
-
-    Each ray is summed on its own: differences of one running sum over all rays would cancel.
-    """
-    return _sum_before(values, rays)
+def _sum_before(values: Float[Array, " M"], rays: Int[Array, " M"], num_used: Array) -> Float[Array, " M"]:
+    return _sum_chunks(values, rays, num_used, reverse=False)
 
 
-def _sum_before_forward(values: Array, rays: Array) -> tuple[Array, Array]:
-    return _sum_before(values, rays), rays
+def _sum_before_forward(values: Array, rays: Array, num_used: Array) -> tuple[Array, tuple]:
+    return _sum_before(values, rays, num_used), (rays, num_used)
 
 
-def _sum_before_backward(rays: Array, cotangent: Array) -> tuple[Array, None]:
-    return _sum_before(cotangent[::-1], rays[::-1])[::-1], None  # what follows is what is before, in reverse
+def _sum_before_backward(residuals: tuple, cotangent: Array) -> tuple[Array, None, None]:
+    return _sum_chunks(cotangent, *residuals, reverse=True), None, None  # what follows is before, in reverse
 
 
-sum_before.defvjp(_sum_before_forward, _sum_before_backward)
+_sum_before.defvjp(_sum_before_forward, _sum_before_backward)
 
 
-def _sum_before(values: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array, " M"]:
+def _sum_chunks(
+    values: Float[Array, " M"], rays: Int[Array, " M"], num_used: Array, *, reverse: bool
+) -> Float[Array, " M"]:
+    """Chunk by chunk, from the first or from the last; a chunk hands on what its last ray has gathered."""
+    count = values.shape[0]
+    chunk = default_chunk(count)
+    values, rays = pad_items((values, rays), chunk)
+    last_start = (num_used + chunk - 1) // chunk * chunk - chunk
+
+    def body(start: Array, carry: tuple) -> tuple:
+        sums, ray, total = carry
+        start = last_start - start if reverse else start
+        part, ids = take((values, rays), start, chunk)
+        part = jnp.where(start + jnp.arange(chunk) < num_used, part, 0)
+        if reverse:
+            part, ids = part[::-1], ids[::-1]
+        before = _sum_rows(part, ids)
+        before += jnp.where((ids == ids[0]) & (ids[0] == ray), total, 0)
+        sums = put(sums, start, before[::-1] if reverse else before)
+        return sums, ids[-1], before[-1] + part[-1]
+
+    carry = jnp.zeros_like(values), jnp.full((), -1, rays.dtype), jnp.zeros((), values.dtype)
+    return for_chunks(num_used, chunk, body, carry)[0][:count]
+
+
+def _sum_rows(values: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array, " M"]:
     """By rows of `ROW` samples: first within each row, then with what the rows before bring in."""
     count = values.shape[0]
     padding = (0, -count % ROW)
     rows = jnp.pad(values, padding).reshape(-1, ROW).T  # [ROW, rows]
-    ids = jnp.pad(rays, padding, mode="edge").reshape(-1, ROW).T if count else jnp.zeros((ROW, 0), rays.dtype)
+    ids = jnp.pad(rays, padding, mode="edge").reshape(-1, ROW).T
     same = ids[1:] == ids[:-1]
 
     def step(before: Array, part: tuple) -> tuple[Array, Array]:
@@ -56,25 +96,60 @@ def _sum_before(values: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Arr
 
     last, sums = jax.lax.scan(step, jnp.zeros_like(rows[0]), (rows[:-1], same))
     sums = jnp.concatenate([jnp.zeros_like(rows[:1]), sums])
-    # What a row leaves to the next: its last ray's sum, and all that came in if that ray fills the row.
-    whole = jnp.all(same, axis=0)
-    joined = jnp.concatenate([jnp.zeros(1, bool), ids[0, 1:] == ids[-1, :-1]])
-    incoming = _carried(last + rows[-1], whole, joined)
-    first_ray = ids == ids[:1]
-    sums += jnp.where(first_ray & joined, incoming, 0)
+    if rows.shape[1] > 1:
+        # A row leaves its last ray's sum to the next; where that ray fills the row, with all that came in.
+        left = last + rows[-1]
+        joined = jnp.pad(ids[0, 1:] == ids[-1, :-1], (1, 0))
+        passes = jnp.all(same, axis=0) & joined
+        runs = running(jnp.maximum, jnp.where(passes, 0, jnp.arange(len(left), dtype=jnp.int32)), 0)
+        after = _sum_rows(left, runs) + left
+        incoming = jnp.where(joined, jnp.pad(after[:-1], (1, 0)), 0)
+        sums += jnp.where(ids == ids[:1], incoming, 0)
     return sums.T.reshape(-1)[:count]
 
 
-def _carried(left: Float[Array, " rows"], whole: Bool[Array, " rows"], joined: Bool[Array, " rows"]) -> Array:
-    """What each row's first ray has gathered in the rows before."""
+def sum_by_ray(
+    weights: Float[Array, " M"],
+    values: Float[Array, "M C"],
+    rays: Int[Array, " M"],
+    num_rays: int,
+    num_used: Int[Array, ""],
+) -> Float[Array, "R C"]:
+    """Each ray's sum of weighted values over the first `num_used` samples; differentiable in reverse mode."""
+    return _sum_by_ray(num_rays, weights, values, rays, num_used)
 
-    def combine(a: tuple, b: tuple) -> tuple:
-        return a[0] & b[0], jnp.where(b[0], a[1] + b[1], b[1])
 
-    passes = whole & joined
-    _, after = jax.lax.associative_scan(combine, (passes, left))
-    before = jnp.concatenate([jnp.zeros_like(left[:1]), after[:-1]])
-    return jnp.where(joined, before, 0)
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _sum_by_ray(num_rays: int, weights: Array, values: Array, rays: Array, num_used: Array) -> Array:
+    chunk = default_chunk(len(weights))
+    items = pad_items((weights, values, rays), chunk)
+
+    def add(start: Array, sums: Array) -> Array:
+        weight, value, ray = take(items, start, chunk)
+        weight = jnp.where(start + jnp.arange(chunk) < num_used, weight, 0)
+        return sums.at[ray].add(weight[:, None] * value)
+
+    return for_chunks(num_used, chunk, add, jnp.zeros((num_rays, values.shape[1]), values.dtype))
+
+
+def _sum_by_ray_forward(num_rays: int, *arguments: Array) -> tuple[Array, tuple]:
+    return _sum_by_ray(num_rays, *arguments), arguments
+
+
+def _sum_by_ray_backward(num_rays: int, arguments: tuple, cotangent: Array) -> tuple:
+    weights, values, rays, num_used = arguments
+
+    def pull(cotangent: Array, part: tuple) -> tuple[Array, Array]:
+        weight, value, ray = part
+        mine = cotangent[ray]
+        return jnp.sum(mine * value, axis=1), weight[:, None] * mine
+
+    d_weights, d_values = map_used(pull, cotangent, (weights, values, rays), num_used)
+    used = jnp.arange(len(weights)) < num_used
+    return jnp.where(used, d_weights, 0), jnp.where(used[:, None], d_values, 0), None, None
+
+
+_sum_by_ray.defvjp(_sum_by_ray_forward, _sum_by_ray_backward)
 
 
 def blend_background(

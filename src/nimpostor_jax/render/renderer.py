@@ -1,18 +1,19 @@
 """From rays to colours: traverse, sample, encode, decode, composite (Figs. 2 and 4, Eqs. 8 and 9)."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import map_used
+from nimpostor_jax.chunks import map_used, pack_where
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.composite import sample_weights
+from nimpostor_jax.render.composite import sample_weights, sum_by_ray
 from nimpostor_jax.render.occupancy import in_occupied_cells
-from nimpostor_jax.render.sampling import Samples, sample_segments, select_samples
+from nimpostor_jax.render.sampling import SamplePlan, Samples, place, place_samples, plan_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, RenderOutput
@@ -53,16 +54,34 @@ def render_samples(
     if tables is None:
         tables = march_tables(impostor.mesh)
     crossings = traverse(tables, local, config.march, entries)
-    segments = locate_segments(impostor.mesh, local, crossings, near)
-    samples = sample_segments(segments, config.sampler, config.density_measure, jitter, refinement)
-    if config.skip_empty and impostor.occupied is not None:
-        keep = in_occupied_cells(impostor.occupied, samples.tet_ids, samples.lambdas)
-        if jitter is not None:
-            keep |= _looks_everywhere(jitter)[samples.rays]
-        samples = select_samples(samples, keep)
+    slots = config.march.capacity_per_ray or config.march.max_tets_per_ray
+    capacity = slots * rays.origins.shape[0]
+    segments = locate_segments(impostor.mesh, local, crossings, near, capacity)
+    plan = plan_samples(segments, config.sampler, config.density_measure, jitter, refinement)
+    chosen, num_used = _occupied(impostor, plan, config)
+    features = None
     if config.min_weight > 0:
-        samples = _visible(impostor, samples, config)
-    return _integrate(impostor, local, samples, segments.overflow, config), samples
+        chosen, features, num_used = _visible(impostor, plan, chosen, num_used, config)
+    samples = place_samples(plan, chosen, num_used)
+    return _integrate(impostor, local, samples, features, segments.overflow), samples
+
+
+def _occupied(
+    impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig
+) -> tuple[Int[Array, " M"], Int[Array, ""]]:
+    """The samples in cells that may be seen; of rays that look everywhere, all."""
+    everything = jnp.arange(plan.owners.size, dtype=jnp.int32)
+    if not config.skip_empty or impostor.occupied is None:
+        return everything, plan.num_used
+
+    def test(shared: tuple, part: tuple) -> Bool[Array, " chunk"]:
+        occupied, arrays = shared
+        tet_ids, lambdas, _, _, rays = place(arrays, part)
+        keep = in_occupied_cells(occupied, tet_ids, lambdas)
+        return keep if arrays.jitter is None else keep | _looks_everywhere(arrays.jitter)[rays]
+
+    frozen = jax.lax.stop_gradient(plan)
+    return pack_where(test, (impostor.occupied, frozen), (everything, plan.owners), plan.num_used)
 
 
 def _looks_everywhere(jitter: Float[Array, " R"]) -> Bool[Array, " R"]:
@@ -74,29 +93,17 @@ def _integrate(
     impostor: NeuralImpostor,
     rays: Rays,
     samples: Samples,
+    known_features: Float[Array, "M C"] | None,
     overflow: Array,
-    config: RenderConfig,
 ) -> RenderOutput:
     num_used = samples.num_used
-    point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used)
+    point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used, known_features)
     directions = field.encode_directions(impostor, rays.directions)
-
-    def decode(shared: tuple, part: tuple) -> tuple[Array, Array]:
-        (decoders, directions), (tet_ids, features, rays) = shared, part
-        sigmas = field.density(decoders, tet_ids, features)
-        return sigmas, field.radiance(decoders, tet_ids, features, directions[rays])
-
-    # Without tables and mesh, or `map_used` would add up gradients of their size for every chunk.
-    decoders = dataclasses.replace(impostor, mesh=None, tables=None, occupied=None)  # type: ignore[arg-type]
     items = (samples.tet_ids, point_features, samples.rays)
-    sigmas, colors = map_used(decode, (decoders, directions), items, num_used)
-
+    sigmas, colors = map_used(_decode, (_only_decoders(impostor), directions), items, num_used)
     weights = _weights(sigmas, samples)
-    sums = jax.ops.segment_sum(
-        weights[:, None] * jnp.column_stack([colors, jnp.ones_like(weights), samples.t]),
-        samples.rays,
-        num_segments=rays.origins.shape[0],
-    )
+    values = jnp.column_stack([colors, jnp.ones_like(weights), samples.t])
+    sums = sum_by_ray(weights, values, samples.rays, rays.origins.shape[0], num_used)
     opacity, depth = sums[:, 3], sums[:, 4]
     visible = opacity > 0
     return RenderOutput(
@@ -108,21 +115,46 @@ def _integrate(
     )
 
 
+def _only_decoders(impostor: NeuralImpostor) -> NeuralImpostor:
+    """Without tables and mesh, or `map_used` would add up gradients of their size for every chunk."""
+    return dataclasses.replace(impostor, mesh=None, tables=None, occupied=None)  # type: ignore[arg-type]
+
+
+def _decode(shared: tuple, part: tuple) -> tuple[Array, Array]:
+    """Densities and colours."""
+    (decoders, directions), (tet_ids, features, rays) = shared, part
+    sigmas = field.density(decoders, tet_ids, features)
+    return sigmas, field.radiance(decoders, tet_ids, features, directions[rays])
+
+
 def _weights(sigmas: Float[Array, " M"], samples: Samples) -> Float[Array, " M"]:
     """Share of its ray's light that each packed sample contributes."""
-    return sample_weights(sigmas * samples.deltas, samples.rays)
+    return sample_weights(sigmas * samples.deltas, samples.rays, samples.num_used)
 
 
-def _visible(impostor: NeuralImpostor, samples: Samples, config: RenderConfig) -> Samples:
-    """The samples that contribute at least `min_weight`, found by a pass over densities without gradient.
+def _visible(
+    impostor: NeuralImpostor,
+    plan: SamplePlan,
+    chosen: Int[Array, " M"],
+    num_used: Int[Array, ""],
+    config: RenderConfig,
+) -> tuple[Int[Array, " M"], Float[Array, "M C"], Int[Array, ""]]:
+    """The samples that contribute at least `min_weight`, and their features: a pass without gradient.
 
     Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
     """
-    frozen, seen = jax.lax.stop_gradient((impostor, samples))
+    frozen, plan = jax.lax.stop_gradient((impostor, plan))
+    samples = place_samples(plan, chosen, num_used)
+    features = field.features(frozen, samples.tet_ids, samples.lambdas, num_used)
+    sigmas = map_used(
+        lambda decoders, part: field.density(decoders, *part),
+        _only_decoders(frozen), (samples.tet_ids, features), num_used,
+    )  # fmt: skip
+    least, weights = config.min_weight, _weights(sigmas, samples)
+    visible, num_visible = pack_where(lambda _, weight: weight >= least, None, weights, num_used)
+    chosen, features = map_used(_rows, (chosen, features), visible, num_visible)
+    return chosen, features, num_visible
 
-    def densities(frozen: NeuralImpostor, part: tuple) -> Array:
-        tet_ids, lambdas = part
-        return field.density(frozen, tet_ids, field.features(frozen, tet_ids, lambdas))
 
-    sigmas = map_used(densities, frozen, (seen.tet_ids, seen.lambdas), seen.num_used)
-    return select_samples(samples, _weights(sigmas, seen) >= config.min_weight)
+def _rows(arrays: Any, indices: Int[Array, " M"]) -> Any:
+    return jax.tree.map(lambda x: x[indices], arrays)

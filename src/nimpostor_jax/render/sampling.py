@@ -4,10 +4,10 @@ A ray's samples are spaced evenly, or with Eq. 4's cone growth, in a measure tha
 Rays need different numbers of samples: they share a buffer of M slots, so that nothing is computed for
 samples that a ray does not have.
 
-Axes: K tet slots, R rays, S samples a ray at most, M packed samples.
+Axes: N packed segments, R rays, S samples a ray at most, M packed samples.
 """
 
-from typing import Any
+import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +15,9 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import default_chunk, map_used, packed_indices, running
+from nimpostor_jax.chunks import default_chunk, map_used, running
 from nimpostor_jax.config import Measure, SamplerConfig
+from nimpostor_jax.render.composite import sum_before
 from nimpostor_jax.types import TetSegments
 
 GOLDEN_RATIO = 0.6180339887498949
@@ -36,7 +37,25 @@ class Samples:
     coarsened: Bool[Array, " R"]  # the ray needed more than S samples and got larger steps
 
 
-def segment_measure(segments: TetSegments, measure: Measure) -> Float[Array, "K R"]:
+@struct.dataclass
+class SamplePlan:
+    """All samples of all rays, numbered by ray and along the ray: where they are, but not yet what."""
+
+    segments: TetSegments
+    starts: Float[Array, " N"]  # measure of the ray before each segment
+    extents: Float[Array, " N"]
+    density: Float[Array, " N"]  # of the density measure in one unit of the step measure
+    boundaries: Float[Array, " S+1"]
+    scale: Float[Array, " R"]  # of the ray's steps
+    firsts: Int[Array, " R"]  # number of the ray's first sample
+    jitter: Float[Array, " R"] | None
+    owners: Int[Array, " M"]  # the segment of each sample
+    num_used: Int[Array, ""]
+    overflow: Bool[Array, " R"]
+    coarsened: Bool[Array, " R"]
+
+
+def segment_measure(segments: TetSegments, measure: Measure) -> Float[Array, " N"]:
     """Extent of each segment: L1 barycentric distance (Eq. 9), 1 a tet (Eq. 4), or length; 0 if empty."""
     if measure == "barycentric":
         return jnp.sum(jnp.abs(segments.lambda_exit - segments.lambda_enter), axis=-1)
@@ -54,124 +73,129 @@ def step_boundaries(config: SamplerConfig) -> np.ndarray:
     return np.asarray(travelled)
 
 
-def sample_segments(
+def plan_samples(
     segments: TetSegments,
     config: SamplerConfig,
     density_measure: Measure,
     jitter: Float[Array, " R"] | None = None,
     refinement: Float[Array, " R"] | None = None,
-) -> Samples:
-    """Place samples on each ray: at the middle of each step, or stratified within it where `jitter` is given.
+) -> SamplePlan:
+    """Count each ray's samples: at the middle of each step, or stratified within it where `jitter` is given.
 
     `jitter` in [0, 1) is one number a ray; its samples' places follow by golden-ratio steps, so that they
     depend neither on the batch around the ray nor on the number of devices. Steps are scaled down so that a
     whole number of them fills the ray exactly. Empty rays get no samples. `refinement` divides a ray's steps.
     """
-    num_slots, num_rays = segments.tet_ids.shape
+    num_rays, owners = segments.overflow.shape[0], segments.rays
     max_samples = config.max_samples_per_ray
     capacity = num_rays * (config.capacity_per_ray or max_samples)
     capacity += -capacity % default_chunk(capacity)  # whole chunks need no padding later
     extents = segment_measure(segments, config.measure)
-    ends = jnp.cumsum(extents, axis=0)
-    total = ends[-1]
-    boundaries = jnp.asarray(step_boundaries(config), ends.dtype)
+    starts = sum_before(extents, owners)
+    total = jax.ops.segment_sum(extents, owners, num_rays, indices_are_sorted=True)
+    boundaries = jnp.asarray(step_boundaries(config), extents.dtype)
     # The tolerance keeps a ray of exactly n steps from getting n + 1 by rounding.
     asked = jax.lax.stop_gradient(total if refinement is None else total * refinement)
     fits = jnp.searchsorted(boundaries, asked * (1 - 1e-5)).astype(jnp.int32)
     wanted = jnp.where(total > 0, jnp.clip(fits, 1, max_samples), 0)
-    scale = total / boundaries[jnp.maximum(wanted, 1)]
     counts = jnp.clip(capacity - (jnp.cumsum(wanted) - wanted), 0, wanted)
     firsts = jnp.cumsum(counts) - counts
+    scale = total / boundaries[jnp.maximum(wanted, 1)]
+    if density_measure == config.measure:
+        density = jnp.ones_like(extents)
+    else:
+        density = segment_measure(segments, density_measure) / jnp.where(extents > 0, extents, 1)
 
-    # Each segment with samples marks its first; what it marks ascends, so that a running maximum spreads it.
-    before = _samples_before(config, ends, extents, boundaries, scale, counts, jitter)
-    starts = jnp.pad(before[:-1], ((1, 0), (0, 0)))
-    slots = jnp.arange(num_slots, dtype=jnp.int32)[:, None]
-    marks = jnp.arange(num_rays, dtype=jnp.int32) * num_slots + slots
-    places = jnp.where(before > starts, firsts + starts, capacity)
-    marked = jnp.zeros(capacity, jnp.int32).at[places.reshape(-1)].set(marks.reshape(-1), mode="drop")
-    marked = running(jnp.maximum, marked, 0)
-    rays, slot = marked // num_slots, marked % num_slots
-    segment = slot * num_rays + rays
-    packed, num_used = jnp.arange(capacity, dtype=jnp.int32), jnp.sum(counts)
-    used = packed < num_used
-    steps = jnp.clip(packed - firsts[rays], 0, max_samples - 1)
-    low, high = boundaries[steps], boundaries[steps + 1]
-    position = (low + _share(steps, jitter, rays) * (high - low)) * scale[rays]
-
-    def pick(values: Float[Array, "K R *rest"]) -> Float[Array, "M *rest"]:
-        return values.reshape(-1, *values.shape[2:])[segment]
-
-    extent, end = pick(extents), pick(ends)
-    inside = jnp.clip(1 - (end - position) / jnp.where(extent > 0, extent, 1), 0, 1)
-    deltas = (high - low) * scale[rays]
-    if density_measure != config.measure:
-        density_extents = segment_measure(segments, density_measure)
-        deltas *= pick(density_extents) / jnp.where(extent > 0, extent, 1)
-    lambda_enter, lambda_exit = pick(segments.lambda_enter), pick(segments.lambda_exit)
-    t_enter, t_exit = pick(segments.t_enter), pick(segments.t_exit)
-    return Samples(
-        tet_ids=jnp.maximum(pick(segments.tet_ids), 0),
-        lambdas=lambda_enter + inside[:, None] * (lambda_exit - lambda_enter),
-        t=t_enter + inside * (t_exit - t_enter),
-        deltas=jnp.where(used, deltas, 0),
-        rays=rays,
-        num_used=num_used,
+    # Each segment with samples marks its first; the marks ascend, so that a running maximum spreads them.
+    before = _samples_before(config, segments, starts, total, boundaries, scale, counts, jitter)
+    same_ray = jnp.pad(owners[1:] == owners[:-1], (0, min(1, owners.size)))
+    until = jnp.where(same_ray, jnp.roll(before, -1), counts[owners])
+    places = jnp.where((extents > 0) & (until > before), firsts[owners] + before, capacity)
+    order = jnp.arange(owners.size, dtype=jnp.int32)
+    marks = jnp.zeros(capacity, jnp.int32).at[places].set(order, mode="drop")
+    return SamplePlan(
+        segments=segments,
+        starts=starts,
+        extents=extents,
+        density=density,
+        boundaries=boundaries,
+        scale=scale,
+        firsts=firsts,
+        jitter=jitter,
+        owners=running(jnp.maximum, marks, 0),
+        num_used=jnp.sum(counts),
         overflow=counts < wanted,
         coarsened=fits > max_samples,
     )
 
 
+def place_samples(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]) -> Samples:
+    """The first `num_used` of the chosen samples, which ascend; differentiable in the plan's segments."""
+    if not plan.owners.size:
+        chosen = chosen[:0]
+    arrays = dataclasses.replace(plan, owners=None, overflow=None, coarsened=None)  # type: ignore[arg-type]
+    columns = map_used(place, arrays, (chosen, plan.owners[chosen]), num_used)
+    tet_ids, lambdas, t, deltas, rays = columns
+    return Samples(
+        tet_ids=tet_ids,
+        lambdas=lambdas,
+        t=t,
+        deltas=jnp.where(jnp.arange(chosen.size) < num_used, deltas, 0),
+        rays=rays,
+        num_used=num_used,
+        overflow=plan.overflow,
+        coarsened=plan.coarsened,
+    )
+
+
+def place(plan: SamplePlan, items: tuple[Int[Array, " M"], Int[Array, " M"]]) -> tuple[Array, ...]:
+    """Tets, coordinates, t, interval lengths and rays of samples, given with their segments (Eq. 5)."""
+    numbers, owners = items
+    segments = plan.segments
+    rays = segments.rays[owners]
+    steps = jnp.clip(numbers - plan.firsts[rays], 0, plan.boundaries.size - 2)
+    low, high, scale = plan.boundaries[steps], plan.boundaries[steps + 1], plan.scale[rays]
+    position = (low + _share(steps, plan.jitter, rays) * (high - low)) * scale
+    extent = plan.extents[owners]
+    end = plan.starts[owners] + extent
+    inside = jnp.clip(1 - (end - position) / jnp.where(extent > 0, extent, 1), 0, 1)
+    lambda_enter, t_enter = segments.lambda_enter[owners], segments.t_enter[owners]
+    return (
+        jnp.maximum(segments.tet_ids[owners], 0),
+        lambda_enter + inside[:, None] * (segments.lambda_exit[owners] - lambda_enter),
+        t_enter + inside * (segments.t_exit[owners] - t_enter),
+        (high - low) * scale * plan.density[owners],
+        rays,
+    )
+
+
 def _share(
-    steps: Int[Array, "*batch"], jitter: Float[Array, " R"] | None, rays: Int[Array, "*batch"]
-) -> Float[Array, "*batch"] | float:
+    steps: Int[Array, " n"], jitter: Float[Array, " R"] | None, rays: Int[Array, " n"]
+) -> Float[Array, " n"] | float:
     """Where in its step a ray's sample is."""
     return 0.5 if jitter is None else (jitter[rays] + GOLDEN_RATIO * steps) % 1
 
 
 def _samples_before(
     config: SamplerConfig,
-    ends: Float[Array, "K R"],
-    extents: Float[Array, "K R"],
+    segments: TetSegments,
+    starts: Float[Array, " N"],
+    total: Float[Array, " R"],
     boundaries: Float[Array, " S+1"],
     scale: Float[Array, " R"],
     counts: Int[Array, " R"],
     jitter: Float[Array, " R"] | None,
-) -> Int[Array, "K R"]:
-    """How many of its ray's samples lie before the end of each segment; none lies in an empty one."""
-    # A parallel sum need not repeat itself over empty slots.
-    ends = jax.lax.cummax(jnp.where(extents > 0, ends, 0), axis=0)
-    position = ends / jnp.where(scale > 0, scale, 1)
+) -> Int[Array, " N"]:
+    """How many of its ray's samples lie before the start of each segment."""
+    rays = segments.rays
+    position = starts / jnp.where(scale > 0, scale, 1)[rays]
     if config.cone_angle == 0:
         step = (position / config.step).astype(jnp.int32)
     else:
         step = jnp.searchsorted(boundaries, position, side="right").astype(jnp.int32) - 1
     step = jnp.clip(step, 0, boundaries.size - 2)
-    rays = jnp.broadcast_to(jnp.arange(ends.shape[1]), ends.shape)
     low, high = boundaries[step], boundaries[step + 1]
     before = step + (low + _share(step, jitter, rays) * (high - low) < position)
-    last = ends >= ends[-1] * (1 - 2 * jnp.finfo(ends.dtype).eps)  # rounding leaves no sample behind it
-    return jnp.where(last, counts, jnp.minimum(before, counts))
-
-
-def select_samples(samples: Samples, keep: Bool[Array, " M"]) -> Samples:
-    """Only the samples to keep, in the same order at the buffer's start."""
-    capacity = samples.t.shape[0]
-    keep &= samples.deltas > 0
-    chosen, num_used = packed_indices(keep)
-    columns = (samples.tet_ids, samples.lambdas, samples.t, samples.deltas, samples.rays)
-
-    def gather(columns: Any, chosen: Array) -> Any:
-        return jax.tree.map(lambda x: x[chosen], columns)
-
-    tet_ids, lambdas, t, deltas, rays = map_used(gather, columns, chosen, num_used)
-    return Samples(
-        tet_ids=tet_ids,
-        lambdas=lambdas,
-        t=t,
-        deltas=jnp.where(jnp.arange(capacity) < num_used, deltas, 0),
-        rays=rays,
-        num_used=num_used,
-        overflow=samples.overflow,
-        coarsened=samples.coarsened,
-    )
+    # Rounding leaves no sample behind the last segment.
+    done = starts >= total[rays] * (1 - 2 * jnp.finfo(starts.dtype).eps)
+    return jnp.where(done, counts[rays], jnp.minimum(before, counts[rays]))

@@ -1,14 +1,19 @@
 """Where each ray enters and leaves its tets: differentiable in vertices and rays (Eq. 3).
 
-Axes: K tet slots, R rays. Barycentric coordinates of the entry and exit points are those within the faces
-that the ray passes, never derived from the tet's volume, so that slivers cost no precision.
+Barycentric coordinates of the entry and exit points are those within the faces that the ray passes, never
+derived from the tet's volume, so that slivers cost no precision.
+
+Axes: R rays, K tet slots of a ray, N packed segments.
 """
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from nimpostor_jax.chunks import running
 from nimpostor_jax.geometry.intersect import face_weights, project, ray_frame
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.render.traverse import CODES_PER_TET, EXIT_TRIANGLES, Crossings
@@ -17,44 +22,88 @@ from nimpostor_jax.types import Rays, TetMesh, TetSegments
 ROUNDING = 8  # units in the last place of t by which a walk may go back unnoticed
 _CODES = np.arange(CODES_PER_TET)
 ENTRY_TRIANGLES = np.array([np.roll(FACES[c // 9], -(c // 3 % 3)) for c in _CODES], np.int32)
-Ends = tuple[Float[Array, "K R"], Float[Array, "K R"], Float[Array, "K R 4"], Float[Array, "K R 4"]]
+Ends = tuple[Float[Array, " N"], Float[Array, " N"], Float[Array, "N 4"], Float[Array, "N 4"]]
 
 
 def locate_segments(
-    mesh: TetMesh, rays: Rays, crossings: Crossings, near: Float[Array, ""] | float = 0.0
+    mesh: TetMesh,
+    rays: Rays,
+    crossings: Crossings,
+    near: Float[Array, ""] | float = 0.0,
+    capacity: int | None = None,
 ) -> TetSegments:
     """Ends of the crossed segments beyond `near` (in the mesh's frame), as t and as barycentric coordinates.
 
     Segments without length (grazed corners, folded tets) and those before `near` become empty slots. Where a
     walk goes back, through inverted tets or along faces seen edge-on, the line is not covered twice: what it
-    passes again begins where it had been before.
+    passes again begins where it had been before. Rays whose crossings do not fit into `capacity` slots, by
+    default as many as `crossings` has, are flagged.
     """
+    num_slots, num_rays = crossings.codes.shape
+    packed = _pack(crossings, num_slots * num_rays if capacity is None else capacity)
+    owners, codes = packed.rays, packed.codes
     geometry = (mesh.vertices, rays.origins, rays.directions)
-    t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, crossings.codes, crossings.ends)
-    behind = jnp.maximum(_covered(crossings.codes >= 0, t_enter, t_exit), near)
-    used = (crossings.codes >= 0) & (t_exit > jnp.maximum(t_enter, behind))
+    t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, owners, codes, packed.ends)
+    behind = jnp.maximum(_covered(owners, codes >= 0, t_enter, t_exit), near)
+    used = (codes >= 0) & (t_exit > jnp.maximum(t_enter, behind))
     cut = used & (t_enter < behind)  # a division only where it counts: lengths may be next to 0
     skipped = jnp.where(cut, behind - t_enter, 0) / jnp.where(cut, t_exit - t_enter, 1)
-    skipped = skipped[..., None]  # share of the segment before that
+    skipped = skipped[:, None]  # share of the segment before that
     return TetSegments(
-        tet_ids=jnp.where(used, crossings.codes // CODES_PER_TET, -1),
+        rays=owners,
+        tet_ids=jnp.where(used, codes // CODES_PER_TET, -1),
         t_enter=jnp.where(used, jnp.maximum(t_enter, behind), 0),
         t_exit=jnp.where(used, t_exit, 0),
-        lambda_enter=jnp.where(used[..., None], lambda_enter + skipped * (lambda_exit - lambda_enter), 0),
-        lambda_exit=jnp.where(used[..., None], lambda_exit, 0),
-        overflow=crossings.overflow,
+        lambda_enter=jnp.where(used[:, None], lambda_enter + skipped * (lambda_exit - lambda_enter), 0),
+        lambda_exit=jnp.where(used[:, None], lambda_exit, 0),
+        overflow=packed.overflow,
+    )
+
+
+class _Packed(NamedTuple):
+    """Crossings by ray, then along each ray: few rays cross as many tets as there are slots."""
+
+    rays: Int[Array, " N"]
+    codes: Int[Array, " N"]
+    ends: tuple[Float[Array, " N"], ...]  # six
+    overflow: Bool[Array, " R"]
+
+
+def _pack(crossings: Crossings, capacity: int) -> _Packed:
+    num_slots, num_rays = crossings.codes.shape
+    lengths = jnp.sum(crossings.codes >= 0, axis=0, dtype=jnp.int32)  # walks fill slots from the first on
+    firsts = jnp.cumsum(lengths) - lengths
+    counts = jnp.clip(capacity - firsts, 0, lengths)
+    # Rays that cross anything mark their first place; a running maximum spreads the marks, which ascend.
+    places = jnp.where(counts > 0, firsts, capacity)
+    marks = jnp.zeros(capacity, jnp.int32).at[places].set(jnp.arange(num_rays, dtype=jnp.int32), mode="drop")
+    rays = running(jnp.maximum, marks, 0)
+    order = jnp.arange(capacity, dtype=jnp.int32)
+    slots = jnp.clip(order - firsts[rays], 0, num_slots - 1)
+
+    def pick(rows: Array) -> Array:
+        return rows.reshape(-1)[slots * num_rays + rays]
+
+    return _Packed(
+        rays=rays,
+        codes=jnp.where(order < jnp.sum(counts), pick(crossings.codes), -1),
+        ends=tuple(map(pick, crossings.ends)),
+        overflow=crossings.overflow | (counts < lengths),
     )
 
 
 def _covered(
-    used: Bool[Array, "K R"], t_enter: Float[Array, "K R"], t_exit: Float[Array, "K R"]
-) -> Float[Array, "K R"]:
+    rays: Int[Array, " N"], used: Bool[Array, " N"], t_enter: Float[Array, " N"], t_exit: Float[Array, " N"]
+) -> Float[Array, " N"]:
     """The t up to which a slot's walk has covered the line before it; t_enter where it has not gone back."""
+    if not rays.size:
+        return t_enter
     rounding = ROUNDING * jnp.finfo(t_exit.dtype).eps * (1 + jnp.abs(t_enter))
 
-    def furthest() -> Float[Array, "K R"]:
+    def furthest() -> Float[Array, " N"]:
         # Crossings of one walk share their ends to the last bit.
-        starts = jnp.pad(t_enter[1:] != t_exit[:-1], ((1, 0), (0, 0)), constant_values=True)
+        starts = (t_enter[1:] != t_exit[:-1]) | (rays[1:] != rays[:-1])
+        starts = jnp.pad(starts, (1, 0), constant_values=True)
 
         def join(left: tuple, right: tuple) -> tuple:
             (t, start), (next_t, next_start) = left, right
@@ -69,7 +118,11 @@ def _covered(
 
 @jax.custom_jvp
 def _ends(
-    geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "K R"], ends: tuple[Float[Array, "K R"], ...]
+    geometry: tuple,
+    tets: Int[Array, "T 4"],
+    rays: Int[Array, " N"],
+    codes: Int[Array, " N"],
+    ends: tuple[Float[Array, " N"], ...],
 ) -> Ends:
     """t and coordinates at both ends, as marched; the derivatives are those of `_recomputed_ends`."""
     local = jnp.maximum(codes, 0) % CODES_PER_TET
@@ -82,18 +135,20 @@ def _ends(
 
 @_ends.defjvp
 def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Ends, Ends]:
-    geometry, tets, codes, _ = primals
-    _, tangents_out = jax.jvp(lambda g: _recomputed_ends(g, tets, codes), (geometry,), (tangents[0],))
+    geometry, tets, rays, codes, _ = primals
+    _, tangents_out = jax.jvp(lambda g: _recomputed_ends(g, tets, rays, codes), (geometry,), (tangents[0],))
     return _ends(*primals), tangents_out
 
 
-def _recomputed_ends(geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array, "K R"]) -> Ends:
+def _recomputed_ends(
+    geometry: tuple, tets: Int[Array, "T 4"], rays: Int[Array, " N"], codes: Int[Array, " N"]
+) -> Ends:
     """What the march computed, as a differentiable function of vertices, origins and directions."""
     vertices, origins, directions = geometry
     codes = jnp.maximum(codes, 0)
     tet_ids, local = codes // CODES_PER_TET, codes % CODES_PER_TET
-    origin = tuple(origins[:, i] for i in range(3))
-    axes = ray_frame(tuple(directions[:, i] for i in range(3)))
+    origin, direction = (tuple(x[rays, i] for i in range(3)) for x in (origins, directions))
+    axes = ray_frame(direction)
     ts, lambdas = [], []
     for triangles in (ENTRY_TRIANGLES, EXIT_TRIANGLES):
         triangle = jnp.asarray(triangles)[local]
@@ -106,8 +161,8 @@ def _recomputed_ends(geometry: tuple, tets: Int[Array, "T 4"], codes: Int[Array,
 
 
 def _spread(
-    triangle: Int[Array, "K R 3"], wa: Float[Array, "K R"], wb: Float[Array, "K R"]
-) -> Float[Array, "K R 4"]:
+    triangle: Int[Array, "N 3"], wa: Float[Array, " N"], wb: Float[Array, " N"]
+) -> Float[Array, "N 4"]:
     """The tet's four coordinates from weights of three of its corners."""
     columns = []
     for i in range(4):
