@@ -33,10 +33,11 @@ from nimpostor_jax.config import ExperimentConfig, RenderConfig
 from nimpostor_jax.field.impostor import init_impostor
 from nimpostor_jax.gin_flags import add_flags, config_from_args, load_config, run_cli
 from nimpostor_jax.io.impostor_file import load_impostor
+from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.evaluate import camera_of, write_json
 from nimpostor_jax.pipeline.prepare import Scene, prepare, use_all_cores
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.frame import frame_config, render_frame
+from nimpostor_jax.render.frame import View, frame_config, render_frame, to_image
 from nimpostor_jax.render.sampling import plan_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
@@ -109,11 +110,13 @@ def time_own(
 ) -> dict[str, Any]:
     """Ours alone: marching, training steps, a frame, and peak memory."""
     rows = [time_traversal(scene, args.repeats)]
-    for interpolation, min_weight in (("grid", 0.0), ("grid", 1e-4), ("simplex", 1e-4)):
-        config = dataclasses.replace(scene.render, min_weight=min_weight)
+    for interpolation, min_weight in (("grid", 0.0), ("grid", None), ("simplex", None)):
+        config = scene.render
+        if min_weight is not None:
+            config = dataclasses.replace(config, min_weight=min_weight)
         rows.append(time_training(scene, interpolation, config, trained, args.repeats))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    rows.append(time_frame(trained or scene.impostor, scene, args.frame_size, args.repeats))
+    rows += time_frames(trained or scene.impostor, scene, args.frame_size, args.repeats)
     return {
         "scene": name,
         "num_tets": scene.impostor.mesh.tets.shape[0],
@@ -165,7 +168,7 @@ def time_training(
     optimizer = make_optimizer()
     devices = jax.local_devices()
     mesh = device_mesh(devices)
-    state = jax.device_put(init_state(impostor, optimizer), replicated(mesh))
+    state = jax.device_put(init_state(impostor, optimizer, config.train.cells_per_edge), replicated(mesh))
     frozen, pool = jax.device_put((impostor, scene.pool), replicated(mesh))
     gradient = data_parallel(mesh)
     step = jax.jit(partial(train_step, optimizer=optimizer, gradient=gradient), static_argnames="config")
@@ -216,16 +219,47 @@ def first_camera(scene: Scene, size: int) -> Camera:
     )
 
 
-def time_frame(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int) -> Row:
-    """A whole frame of the first test camera, at `size` pixels in width."""
-    large = first_camera(scene, size)
-    sized = frame_config(impostor, large, scene.config.render)
-    first, median = measure(lambda: render_frame(impostor, large, sized), repeats)
-    return {
-        "name": f"frame_{large.width}x{large.height}",
-        "ms": 1e3 * median,
-        "compile_s": first - median,
+def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int) -> list[Row]:
+    """A frame of the first test camera, and what it would cost without each skip, in turns.
+
+    `psnr_to_exact` compares with the frame of every sample of every pixel: what the skips change.
+    """
+    camera = first_camera(scene, size)
+    full = scene.config.render
+    everything = dataclasses.replace(full, skip_empty=False, min_weight=0.0)
+    settings = {
+        "": (full, False),
+        "_with_empty_cells": (dataclasses.replace(full, skip_empty=False), False),
+        "_with_invisible_samples": (dataclasses.replace(full, min_weight=0.0), False),
+        "_with_empty_pixels": (full, True),
+        "_with_everything": (everything, True),
     }
+    calls, images, times = {}, {}, {}
+    pixels = np.arange(camera.width * camera.height)
+    for name, (config, all_pixels) in settings.items():
+        config = frame_config(impostor, camera, config)
+        if all_pixels:
+            calls[name] = lambda config=config: View(impostor, camera, config).render(pixels)
+        else:
+            calls[name] = partial(render_frame, impostor, camera, config)
+        start = time.perf_counter()
+        calls[name]()
+        times[name] = [time.perf_counter() - start]
+        images[name] = to_image(render_frame(impostor, camera, config))
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.perf_counter()
+            call()
+            times[name].append(time.perf_counter() - start)
+    return [
+        {
+            "name": f"frame_{camera.width}x{camera.height}{name}",
+            "ms": 1e3 * float(np.median(times[name][1:])),
+            "compile_s": times[name][0] - float(np.median(times[name][1:])),
+            "psnr_to_exact": float(psnr(images[name], images["_with_everything"])),
+        }
+        for name in settings
+    ]
 
 
 if __name__ == "__main__":

@@ -5,9 +5,10 @@
 
 Cages are cubes of n³ cells of six tets, their inner vertices jittered. `cage` rows march one image through
 growing cages: camera rays, tile by tile, and as many rays without any order, as in a training batch.
-`image` rows march growing images through one cage, in chunks as frames are. Each row runs in a process of
-its own, for its peak memory. An exponent e means that the time per ray grows like tets^e, or the time like
-pixels^e; cages below 300 tets, and images below 200², where fixed costs show, are left out of the fits.
+`image` rows march growing images through one cage, in chunks as frames are; `call` rows march one image with
+more and more rays a call. Each row runs in a process of its own, for its peak memory. An exponent e means
+that the time per ray grows like tets^e, or the time like pixels^e; cages below 300 tets, and images below
+200², where fixed costs show, are left out of the fits.
 """
 
 import argparse
@@ -40,6 +41,7 @@ SIZES = (100, 200, 400, 800, 1600)
 CHUNK = 8192  # rays a call, as in render_frame
 CAGE_IMAGE = 256  # pixels on the side of the image that growing cages are seen in
 IMAGE_CELLS = 8  # of the cage that growing images are made of
+CALLS = tuple(1 << n for n in range(12, 21, 2))  # rays
 
 
 def main(argv: Sequence[str]) -> None:
@@ -51,12 +53,15 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args(argv)
     jobs = [
-        (sweep, cells, min(CAGE_IMAGE, args.max_size), args.repeats)
+        (sweep, cells, min(CAGE_IMAGE, args.max_size), CHUNK, args.repeats)
         for cells in CELLS
         if 6 * cells**3 <= args.max_tets
         for sweep in ("cage", "cage_unordered")
     ]
-    jobs += [("image", IMAGE_CELLS, size, args.repeats) for size in SIZES if size <= args.max_size]
+    sizes = [size for size in SIZES if size <= args.max_size]
+    jobs += [("image", IMAGE_CELLS, size, CHUNK, args.repeats) for size in sizes]
+    side = 1 << min(10, args.max_size.bit_length() - 1)
+    jobs += [("call", IMAGE_CELLS, side, rays, args.repeats) for rays in CALLS if rays <= side**2]
     rows = []
     spawn = multiprocessing.get_context("spawn")
     for job in tqdm(jobs, disable=None):
@@ -99,7 +104,7 @@ def unordered_rays(count: int) -> Rays:
     return Rays(origins=jnp.asarray(origins, jnp.float32), directions=jnp.asarray(directions, jnp.float32))
 
 
-def time_march(sweep: str, cells: int, size: int, repeats: int) -> Row:
+def time_march(sweep: str, cells: int, size: int, rays_a_call: int, repeats: int) -> Row:
     """Build a cage and march an image's rays through it, chunk by chunk: medians of CPU time."""
     vertices, tets = cage(cells)
     start = time.process_time()
@@ -108,7 +113,7 @@ def time_march(sweep: str, cells: int, size: int, repeats: int) -> Row:
     rays = unordered_rays(size * size) if sweep == "cage_unordered" else camera_rays(size)
     rays = Rays(origins=(rays.origins - mesh.center) / mesh.scale, directions=rays.directions)
     tables = jax.jit(march_tables)(mesh)
-    chunk = min(CHUNK, size * size)
+    chunk = min(rays_a_call, size * size)
     chunks = [jax.tree.map(lambda x, i=i: x[i : i + chunk], rays) for i in range(0, size * size, chunk)]
     chunks[-1] = jax.tree.map(lambda x: x[-chunk:], rays)
     # A line meets at most 3 n diagonal and axis-parallel planes in each of two directions; entries are few.
@@ -135,6 +140,7 @@ def time_march(sweep: str, cells: int, size: int, repeats: int) -> Row:
         "tets": len(tets),
         "pixels": size * size,
         "rays": count,
+        "rays_a_call": chunk,
         "ms": 1e3 * seconds,
         "ns_per_ray": 1e9 * seconds / count,
         "ns_per_segment": 1e9 * seconds / max(segments, 1),

@@ -86,7 +86,7 @@ def render_frame(
         most = MAX_REFINEMENT * config.sampler.max_samples_per_ray
         sampler = dataclasses.replace(config.sampler, max_samples_per_ray=most)
         config = dataclasses.replace(config, sampler=sampler)
-    view = _View(impostor, camera, config)
+    view = View(impostor, camera, config)
     pixels, order = view.hits, tile_order(height, width)
     output = view.render(pixels)
     frame = {name: np.zeros((height * width, *x.shape[1:]), x.dtype) for name, x in output.items()}
@@ -112,7 +112,7 @@ def render_frame(
     return Frame(**{name: x.reshape(height, width, *x.shape[1:]) for name, x in frame.items()})
 
 
-class _View:
+class View:
     """A camera's rays, and `render_rays` of any of them on all local devices, compiled once."""
 
     def __init__(self, impostor: NeuralImpostor, camera: Camera, config: RenderConfig):

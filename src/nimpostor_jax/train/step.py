@@ -21,6 +21,7 @@ from nimpostor_jax.types import NeuralImpostor, Rays
 Parameters = dict[str, Any]
 Metrics = dict[str, Array]
 
+NEVER = -(1 << 30)  # step of a cell that no ray has seen
 MAX_CELLS = 1 << 19  # of all tets: more would see too few rays before they are forgotten
 
 
@@ -71,9 +72,14 @@ def learning_rate(config: TrainConfig, progress: float, step: int) -> float:
 def init_state(
     impostor: NeuralImpostor, optimizer: optax.GradientTransformation, cells_per_edge: int = 0
 ) -> TrainState:
-    """The state before the first step. Of large cages, tets are cut into fewer cells than asked for."""
+    """The state before the first step. Of large cages, tets are cut into fewer cells than asked for.
+
+    An impostor that has been trained already goes on with its own cells.
+    """
     parameters, last_seen = trainable(impostor), None
-    if cells_per_edge:
+    if impostor.occupied is not None:
+        last_seen = jnp.where(impostor.occupied, 0, NEVER)
+    elif cells_per_edge:
         num_tets = impostor.mesh.tets.shape[0]
         while cells_per_edge > 1 and num_tets * num_cells(cells_per_edge) > MAX_CELLS:
             cells_per_edge //= 2
