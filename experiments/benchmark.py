@@ -246,6 +246,7 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
         calls[name]()
         times[name] = [time.perf_counter() - start]
         images[name] = to_image(render_frame(impostor, camera, config))
+        print(f"frame{name}: {times[name][0]:.1f} s with compilation", flush=True)
     for _ in range(repeats):
         for name, call in calls.items():
             start = time.perf_counter()

@@ -79,7 +79,7 @@ def main(argv: Sequence[str]) -> None:
         impostors[f"run {folder.name}"] = load_impostor(folder / "impostor.npz")
         settings.append((f"run {folder.name}", "", config.render))
     rows = []
-    for lever, value, render in tqdm(settings, desc="errors", disable=None):
+    for lever, value, render in settings:
         shown = impostors.get(lever, impostor)
         render = frame_config(shown, cameras[0], render)
         tolerance = value if lever == "tolerance" else None
@@ -100,6 +100,7 @@ def main(argv: Sequence[str]) -> None:
                 "render": (shown, render, tolerance),
             }
         )
+        print(f"{lever} {value}: mean error {rows[-1]['mean_error']:.6f}", flush=True)
     for _ in tqdm(range(args.repeats), desc="timing", disable=None):
         for row in rows:
             start = time.perf_counter()

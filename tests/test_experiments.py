@@ -49,17 +49,18 @@ def test_the_oracle_agrees_with_the_march(marched):
 def test_a_lost_a_doubled_and_a_broken_segment_are_noticed(marched):
     stress, solid, lines, segments, mesh = marched
     length = np.asarray(segments.t_exit - segments.t_enter)
-    slot, ray = np.unravel_index(np.argmax(length), length.shape)
-    lost = segments.replace(t_exit=segments.t_exit.at[slot, ray].set(segments.t_enter[slot, ray]))
-    assert errors_of(stress, solid, lines, lost)[ray] == pytest.approx(-length[slot, ray], abs=1e-3)
+    longest = np.argmax(length)
+    ray = int(segments.rays[longest])
+    lost = segments.replace(t_exit=segments.t_exit.at[longest].set(segments.t_enter[longest]))
+    assert errors_of(stress, solid, lines, lost)[ray] == pytest.approx(-length[longest], abs=1e-3)
     halved = segments.replace(t_exit=(segments.t_enter + segments.t_exit) / 2)
     assert stress.color_errors(mesh, solid, halved, lines, 1e-4).max() > 0.01
-    longer = segments.replace(t_exit=segments.t_exit.at[slot, ray].add(0.1))
+    longer = segments.replace(t_exit=segments.t_exit.at[longest].add(0.1))
     assert errors_of(stress, solid, lines, longer)[ray] > 0.09
-    twice = jnp.concatenate([segments.t_enter, segments.t_enter])
-    twice_exit = jnp.concatenate([segments.t_exit, segments.t_exit])
-    assert stress.overlapping(segments.replace(t_enter=twice, t_exit=twice_exit), 1e-4)[ray]
-    broken = segments.replace(t_enter=segments.t_enter.at[0, 0].set(jnp.nan))
+    columns = ("rays", "tet_ids", "t_enter", "t_exit", "lambda_enter", "lambda_exit")
+    twice = segments.replace(**{name: jnp.repeat(getattr(segments, name), 2, axis=0) for name in columns})
+    assert stress.overlapping(twice, 1e-4)[ray]
+    broken = segments.replace(t_enter=segments.t_enter.at[0].set(jnp.nan))
     assert stress.count_nonfinite(broken) == 1
 
 
@@ -98,7 +99,7 @@ def test_exponents_are_slopes_of_logarithms():
 
 
 def test_scaling_measures_a_small_cage():
-    row = importlib.import_module("scaling").time_march("cage", 2, 32, 1)
+    row = importlib.import_module("scaling").time_march("cage", 2, 32, 1024, 1)
     assert row["tets"] == 48 and row["rays"] == 1024
     assert row["ms"] > 0 and row["peak_memory_gib"] > 0
     assert 1 < row["segments_per_ray"] < 24

@@ -90,7 +90,7 @@ def _encode(
         return for_chunks(num_used, chunk, encode_chunk, out)
 
     shape = (tet_ids.shape[0], config.num_levels, features.shape[1])
-    out = _for_levels(config, layout, add_level, jnp.zeros(shape, features.dtype))
+    out = _for_levels(config, layout, add_level, jnp.zeros(shape, jnp.result_type(features, lambdas)))
     return out.reshape(shape[0], -1)
 
 

@@ -91,7 +91,7 @@ def prepare(
 ) -> Scene:
     """Read a scene (a folder or a built-in name), read or build its cage, initialise the impostor.
 
-    A cage that is built is saved as `cage_output`. All input is checked before anything long starts.
+    The cage is saved as `cage_output`, unless there is one. All input is checked before anything long starts.
 
     Raises:
         FileNotFoundError, ValueError: missing or inconsistent data, empty masks, a bad cage, or a cage that
@@ -156,15 +156,15 @@ def load_cage(
     if cage is None:
         check_masks(train)
         vertices, tets = cage_from_images(train, config.cage, log)
-        if cage_output is not None:
-            save_tets(cage_output, vertices, tets)
-            log(f"cage saved as {cage_output}")
-        return vertices, tets
-    vertices, tets = load_tets(cage)
-    check_tets(vertices, tets, str(cage))
-    if train.has_alpha.all():
-        views = (train.camera_to_world, train.focal, train.principal)
-        missed = missed_foreground(vertices, tets, train.masks, *views)
-        log(f"{cage}: {quality_report(vertices, tets)}; {missed}")
-        check_coverage(missed, config.cage.max_missed_share, train.names, str(cage))
+    else:
+        vertices, tets = load_tets(cage)
+        check_tets(vertices, tets, str(cage))
+        if train.has_alpha.all():
+            views = (train.camera_to_world, train.focal, train.principal)
+            missed = missed_foreground(vertices, tets, train.masks, *views)
+            log(f"{cage}: {quality_report(vertices, tets)}; {missed}")
+            check_coverage(missed, config.cage.max_missed_share, train.names, str(cage))
+    if cage_output is not None and not Path(cage_output).exists():  # an earlier run's stays its own
+        save_tets(cage_output, vertices, tets)
+        log(f"cage saved as {cage_output}")
     return vertices, tets

@@ -20,6 +20,9 @@ from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
 from nimpostor_jax.types import Rays, TetMesh
 
+# A chunk of a frame is 32 image tiles from all over it, whose mean varies by a tenth. Room that is not used
+# costs next to nothing; rays that do not fit cost a second program.
+SHARED_MARGIN = 1.4
 MAX_GROWTH = 6  # doublings of a buffer before giving up
 
 
@@ -63,7 +66,8 @@ def fit_capacities(
 ) -> RenderConfig:
     """A config whose buffers hold these sample rays (drawn like those to come), with a margin.
 
-    Slots are rounded up to multiples of 8; `max_samples_per_ray` of the given config stays the limit.
+    `margin` is that of a single ray's slots; buffers that rays share have `SHARED_MARGIN`. Slots are rounded
+    up to multiples of 8; `max_samples_per_ray` of the given config stays the limit.
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
     tets, overflow, total = _demand(mesh, tables, rays, config)
@@ -81,13 +85,12 @@ def fit_capacities(
     boundaries = step_boundaries(config.sampler)
     wanted = np.clip(np.searchsorted(boundaries, np.asarray(total) * (1 - 1e-5)), 0, len(boundaries) - 1)
     most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
+    most_tets = _round_up(margin * int(jnp.max(tets)))
     march = dataclasses.replace(
-        config.march,
-        max_tets_per_ray=_round_up(margin * int(jnp.max(tets))),
-        capacity_per_ray=_mean(np.asarray(tets), margin),
+        config.march, max_tets_per_ray=most_tets, capacity_per_ray=min(most_tets, _mean(np.asarray(tets)))
     )
     sampler = dataclasses.replace(
-        config.sampler, max_samples_per_ray=most, capacity_per_ray=min(most, _mean(wanted, margin))
+        config.sampler, max_samples_per_ray=most, capacity_per_ray=min(most, _mean(wanted))
     )
     return dataclasses.replace(config, march=march, sampler=sampler)
 
@@ -103,9 +106,9 @@ def grow_march(config: RenderConfig) -> RenderConfig:
     return dataclasses.replace(config, march=march)
 
 
-def _mean(needed: np.ndarray, margin: float) -> int:
-    """Room for a mean ray: rays share a buffer, so that its load fluctuates less than a single ray's."""
-    return max(1, int(np.ceil((1 + (margin - 1) / 2) * needed.mean())))
+def _mean(needed: np.ndarray) -> int:
+    """Room for a mean ray, with the margin of buffers that many rays share."""
+    return max(1, int(np.ceil(SHARED_MARGIN * needed.mean())))
 
 
 def _round_up(value: float) -> int:
