@@ -137,9 +137,11 @@ def levers(base: RenderConfig) -> list[tuple[str, Any, RenderConfig]]:
     """(lever, value, config): the given config, and it with one field changed at a time."""
 
     def sampler(**changes: Any) -> RenderConfig:
-        return dataclasses.replace(base, sampler=dataclasses.replace(base.sampler, **changes))
+        changed = dataclasses.replace(base.sampler, **changes)
+        return dataclasses.replace(base, sampler=changed, frame_refinement=1.0)
 
-    settings: list[tuple[str, Any, RenderConfig]] = [("default", base.sampler.step, base)]
+    default = base.sampler.step / base.frame_refinement
+    settings: list[tuple[str, Any, RenderConfig]] = [("default", default, base)]
     many = {"max_samples_per_ray": 1024}  # no ray is coarsened
     for step in (0.5, 0.25, 0.125, 0.0625):
         settings.append(("step", step, sampler(step=step, **many)))
@@ -173,7 +175,9 @@ def reference_frame(impostor: NeuralImpostor, camera: Camera, render: RenderConf
         render.sampler, measure="barycentric", step=REFERENCE_STEP, cone_angle=0.0,
         max_samples_per_ray=REFERENCE_SAMPLES, capacity_per_ray=None,
     )  # fmt: skip
-    exact = dataclasses.replace(render, sampler=sampler, min_weight=REFERENCE_WEIGHT, skip_empty=False)
+    exact = dataclasses.replace(
+        render, sampler=sampler, min_weight=REFERENCE_WEIGHT, skip_empty=False, frame_refinement=1.0
+    )
     with jax.enable_x64(True):
         impostor, camera = jax.tree.map(
             lambda x: x.astype("float64") if x.dtype == "float32" else x, (impostor, camera)

@@ -28,6 +28,7 @@ RENDER = RenderConfig(
     march=MarchConfig(max_tets_per_ray=8, max_entries_per_ray=2),
     sampler=SamplerConfig(step=0.5, max_samples_per_ray=16),
     min_weight=0.0,
+    frame_refinement=1.0,
 )
 
 

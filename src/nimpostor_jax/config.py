@@ -185,9 +185,11 @@ class RenderConfig:
     near: float = 0.0  # in world units
     min_weight: float = 1e-3  # samples that contribute less get no colour and no gradient; 0: all do
     skip_empty: bool = True  # leave out samples in cells that training found empty or hidden
+    frame_refinement: float = 2.0  # divides the steps of frames; in training, jitter makes up for long steps
 
     def __post_init__(self) -> None:
         _require(0 <= self.min_weight < 1, self, "min_weight", "in [0, 1)")
+        _require(self.frame_refinement >= 1, self, "frame_refinement", ">= 1")
         _require(
             self.density_measure in ("barycentric", "euclidean"),
             self,

@@ -59,6 +59,19 @@ def test_a_frame_is_the_picture_of_its_rays(scene):
     assert 512 < covered.sum() < covered.size  # several chunks, and some background
 
 
+def test_frames_have_finer_steps(scene):
+    """Half of them here, and samples that weigh half; fitting buffers first does not halve them again."""
+    impostor, camera = scene
+    config = dataclasses.replace(RENDER, min_weight=0.02, frame_refinement=2.0)
+    expected = whole_image(
+        impostor,
+        camera,
+        dataclasses.replace(exact(step=0.25, max_samples_per_ray=32), min_weight=0.01),
+    )
+    check_equal(render_frame(impostor, camera, config), expected)
+    check_equal(render_frame(impostor, camera, frame_config(impostor, camera, config)), expected)
+
+
 def test_overflow_is_repaired(scene):
     impostor, camera = scene
     expected = whole_image(impostor, camera, RENDER)
@@ -67,14 +80,16 @@ def test_overflow_is_repaired(scene):
     check_equal(render_frame(impostor, camera, config), expected)
 
 
-def test_a_tolerance_is_met(scene):
+@pytest.mark.parametrize("min_weight", [0.0, 5e-3])
+def test_a_tolerance_is_met(scene, min_weight):
     """Against steps 32 times as fine as the config's: here that is converged."""
     impostor, camera = scene
+    config = dataclasses.replace(RENDER, min_weight=min_weight)
     fine = exact(step=RENDER.sampler.step / 64, max_samples_per_ray=2048)
     expected = render_frame(impostor, camera, fine)
     errors = {}
     for tolerance in (None, 1 / 255):
-        frame = render_frame(impostor, camera, RENDER, tolerance)
+        frame = render_frame(impostor, camera, config, tolerance)
         errors[tolerance] = np.max(np.abs(frame.color - expected.color), axis=-1)
         assert (frame.error is None) == (tolerance is None)
     assert errors[None].max() > 4 / 255  # the test could not fail otherwise

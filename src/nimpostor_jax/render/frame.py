@@ -1,6 +1,7 @@
 """Whole images, in chunks of rays that hit the cage: host code around the jitted renderer."""
 
 import dataclasses
+import math
 from functools import cache, partial
 from typing import NamedTuple
 
@@ -46,11 +47,12 @@ def _tiled_pixels(height: int, width: int) -> jax.Array:
 
 
 def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> RenderConfig:
-    """`config` with buffer sizes that fit this camera's view; use it for a whole animation.
+    """`config` with a frame's steps and buffers that fit this camera's view; use it for a whole animation.
 
     Sizes are measured on pixels spread over those that hit the cage. What overflows nevertheless,
     `render_frame` renders again.
     """
+    config = _refined(config)
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, camera.height, camera.width)
     entries, march = all_entries(impostor.mesh, tables, rays, config.march)
@@ -61,6 +63,20 @@ def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     chosen = hits[np.linspace(0, hits.size - 1, CHUNK).round().astype(int)]
     probe = jax.tree.map(lambda x: x[chosen], rays)
     return fit_capacities(impostor.mesh, tables, probe, config)
+
+
+def _refined(config: RenderConfig) -> RenderConfig:
+    """With the steps of frames; once is enough."""
+    factor, sampler = config.frame_refinement, config.sampler
+    most = math.ceil(factor * sampler.max_samples_per_ray)
+    mean = sampler.capacity_per_ray and math.ceil(factor * sampler.capacity_per_ray)
+    sampler = dataclasses.replace(
+        sampler, step=sampler.step / factor, max_samples_per_ray=most, capacity_per_ray=mean
+    )
+    # A sample's weight is in proportion to its step.
+    return dataclasses.replace(
+        config, sampler=sampler, min_weight=config.min_weight / factor, frame_refinement=1.0
+    )
 
 
 def render_frame(
@@ -76,16 +92,17 @@ def render_frame(
     With a `tolerance`, each pixel's steps are halved until that hardly changes its colour and opacity: by a
     32nd of the tolerance, or by half of it after a change within it. The last change is returned as `error`;
     it is larger where 1 / `MAX_REFINEMENT` of the steps did not suffice. One small change is no proof: two
-    coarse quadratures may miss the same detail. Samples below `min_weight` are left out all the same.
-    Raises ValueError for a tolerance that is not positive.
+    coarse quadratures may miss the same detail. Samples below a 32nd of the tolerance are left out, and those
+    below `min_weight`. Raises ValueError for a tolerance that is not positive.
     """
-    height, width = camera.height, camera.width
+    height, width, config = camera.height, camera.width, _refined(config)
     if tolerance is not None:
         if not tolerance > 0:
             raise ValueError(f"tolerance must be > 0, got {tolerance}")
         most = MAX_REFINEMENT * config.sampler.max_samples_per_ray
         sampler = dataclasses.replace(config.sampler, max_samples_per_ray=most)
-        config = dataclasses.replace(config, sampler=sampler)
+        least = min(config.min_weight, tolerance / 32)
+        config = dataclasses.replace(config, sampler=sampler, min_weight=least)
     view = View(impostor, camera, config)
     pixels, order = view.hits, tile_order(height, width)
     output = view.render(pixels)

@@ -34,7 +34,7 @@ def render_rays(
     in [0, 1) samples move within their steps (training); without, they sit in the middle. Pass `tables` to
     spare rearranging the mesh in every call; by default they are made from the mesh's current vertices. Pass
     the rays' `entries` (`traverse.find_entries`) where the same rays see the same mesh again.
-    `refinement` divides the steps of each ray.
+    `refinement` divides the steps of each ray, and `min_weight`.
     """
     return render_samples(impostor, rays, config, jitter, tables, entries, refinement)[0]
 
@@ -61,7 +61,7 @@ def render_samples(
     chosen, num_used = _occupied(impostor, plan, config)
     features = None
     if config.min_weight > 0:
-        chosen, features, num_used = _visible(impostor, plan, chosen, num_used, config)
+        chosen, features, num_used = _visible(impostor, plan, chosen, num_used, config, refinement)
     samples = place_samples(plan, chosen, num_used)
     return _integrate(impostor, local, samples, features, segments.overflow), samples
 
@@ -138,8 +138,11 @@ def _visible(
     chosen: Int[Array, " M"],
     num_used: Int[Array, ""],
     config: RenderConfig,
+    refinement: Float[Array, " R"] | None,
 ) -> tuple[Int[Array, " M"], Float[Array, "M C"], Int[Array, ""]]:
     """The samples that contribute at least `min_weight`, and their features: a pass without gradient.
+
+    With finer steps, samples that contribute less in proportion are kept.
 
     Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
     """
@@ -151,6 +154,8 @@ def _visible(
         _only_decoders(frozen), (samples.tet_ids, features), num_used,
     )  # fmt: skip
     least, weights = config.min_weight, _weights(sigmas, samples)
+    if refinement is not None:
+        weights *= refinement[samples.rays]
     visible, num_visible = pack_where(lambda _, weight: weight >= least, None, weights, num_used)
     chosen, features = map_used(_rows, (chosen, features), visible, num_visible)
     return chosen, features, num_visible
