@@ -37,6 +37,8 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/versions.json"))
     parser.add_argument("--gin_configs", default=str(ROOT / "experiments/configs/mic.gin"))
     args = parser.parse_args(argv)
+    if args.steps < 3 * LOG_EVERY:
+        parser.error(f"--steps must be at least {3 * LOG_EVERY}: a line is logged every {LOG_EVERY}")
     with tempfile.TemporaryDirectory() as folder, checked_out(args.base, Path(folder) / "base") as base:
         found: dict[str, list[dict[str, float]]] = {"base": [], "this": []}
         for turn in range(args.rounds):
@@ -71,11 +73,16 @@ def train(root: Path, workdir: Path, args: argparse.Namespace) -> dict[str, floa
     command += [f"--data={args.data.resolve()}", f"--cage={args.cage.resolve()}", f"--workdir={workdir}"]
     command += ["--gin_bindings", f"TrainConfig.steps={args.steps}", f"TrainConfig.log_every={LOG_EVERY}"]
     environment = os.environ | {"PYTHONPATH": str(root / "src")}
-    subprocess.run(command, check=True, env=environment, capture_output=True)
-    with open(workdir / "log.csv", newline="", encoding="utf-8") as file:
-        seconds = [float(row["seconds"]) for row in csv.DictReader(file) if int(row["step"]) % LOG_EVERY == 0]
+    subprocess.run(command, check=True, env=environment, stdout=subprocess.DEVNULL)
     metrics = json.loads((workdir / "metrics.json").read_text(encoding="utf-8"))
-    return {"step_ms": float(np.median(np.diff(seconds))) * 1e3 / LOG_EVERY, "psnr": metrics["psnr"]}
+    return {"step_ms": step_ms(workdir / "log.csv"), "psnr": metrics["psnr"]}
+
+
+def step_ms(log: Path) -> float:
+    """Milliseconds a step: the median over a log's lines, each of `LOG_EVERY` steps."""
+    with open(log, newline="", encoding="utf-8") as file:
+        seconds = [float(row["seconds"]) for row in csv.DictReader(file) if int(row["step"]) % LOG_EVERY == 0]
+    return float(np.median(np.diff(seconds))) * 1e3 / LOG_EVERY
 
 
 if __name__ == "__main__":

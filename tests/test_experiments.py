@@ -167,3 +167,13 @@ def test_float64_chords_add_up(peers):
     directions = np.stack([np.eye(3)[0], np.eye(3)[1]])
     lengths = geometry.chords(*cage, origins, directions)
     np.testing.assert_allclose(lengths, [high[0] - low[0], 0], atol=1e-12)
+
+
+def test_step_times_are_medians_of_whole_lines(monkeypatch, tmp_path):
+    """The first line counts one step only, and compiles."""
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    versions = importlib.import_module("compare_versions")
+    lines = [(1, 9.0), (50, 10.0), (100, 15.0), (150, 21.0), (200, 100.0)]
+    log = tmp_path / "log.csv"
+    log.write_text("step,seconds\n" + "".join(f"{step},{seconds}\n" for step, seconds in lines))
+    assert versions.step_ms(log) == pytest.approx(6e3 / 50)

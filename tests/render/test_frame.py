@@ -11,13 +11,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rays import as_rays, generic, missing
 from scenes import RENDER, exact
 
-from nimpostor_jax.config import MarchConfig
+from nimpostor_jax.config import MarchConfig, SamplerConfig
 from nimpostor_jax.render import capacity
 from nimpostor_jax.render import frame as frames
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
 from nimpostor_jax.render.capacity import fit_capacities, ray_entries
-from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import frame_config, refined, render_frame, to_image
 from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.sampling import step_boundaries
 from nimpostor_jax.render.traverse import march_tables, traverse
 
 render = jax.jit(render_rays, static_argnames="config")
@@ -70,6 +71,16 @@ def test_frames_have_finer_steps(scene):
     )
     check_equal(render_frame(impostor, camera, config), expected)
     check_equal(render_frame(impostor, camera, frame_config(impostor, camera, config)), expected)
+
+
+def test_steps_that_grow_are_refined_all_along():
+    """Twice as many steps to wherever a ray ends."""
+    sampler = SamplerConfig(step=0.02, cone_angle=0.01, max_samples_per_ray=64)
+    config = dataclasses.replace(RENDER, sampler=sampler, frame_refinement=2.0)
+    coarse, fine = (step_boundaries(c.sampler) for c in (config, refined(config)))
+    for steps in range(8, 65, 8):
+        # A step grows at its end, not on its way: that moves the end by less than a fine step.
+        assert np.searchsorted(fine, coarse[steps]) == pytest.approx(2 * steps, abs=1)
 
 
 def test_overflow_is_repaired(scene):

@@ -121,6 +121,17 @@ def test_cells_that_no_ray_sees_are_forgotten_and_found_again():
     assert np.mean(occupied_cells(after, 3)) > 0
 
 
+def test_a_trained_impostor_goes_on_with_its_cells():
+    """Empty ones stay so, however long cells are kept, and the step compiles once."""
+    impostor, batch = scene()
+    cells = np.arange(len(impostor.mesh.tets) * 20).reshape(-1, 20) % 3 == 0
+    state = init_state(dataclasses.replace(impostor, occupied=jnp.asarray(cells)), OPTIMIZER, 8)
+    assert_array_equal(occupied_cells(state, 1_000_000), cells)
+    step = stepper()
+    for _ in range(2):
+        state, _ = step(state, impostor, batch, RATE)
+
+
 def test_large_cages_get_fewer_cells(monkeypatch):
     impostor, _ = scene()
     monkeypatch.setattr("nimpostor_jax.train.step.MAX_CELLS", 200)

@@ -47,7 +47,10 @@ def use_all_cores() -> None:
 
 
 def _keep_freed_memory() -> None:
-    """Let glibc reuse large blocks: XLA takes buffers anew for each call, and fresh pages cost a tenth."""
+    """Let glibc reuse large blocks: XLA takes buffers anew for each call, and fresh pages cost up to half.
+
+    One arena, because glibc gives other threads' arenas back whenever a block needs more than 64 MiB.
+    """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # another C library
@@ -55,7 +58,6 @@ def _keep_freed_memory() -> None:
     mallopt(ctypes.c_int(-8), ctypes.c_int(1))  # M_ARENA_MAX
     mallopt(ctypes.c_int(-4), ctypes.c_int(0))  # M_MMAP_MAX
     mallopt(ctypes.c_int(-1), ctypes.c_int(2**31 - 1))  # M_TRIM_THRESHOLD
-
 
 
 def warn_of_slow_scatter() -> None:

@@ -52,7 +52,7 @@ def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     Sizes are measured on pixels spread over those that hit the cage. What overflows nevertheless,
     `render_frame` renders again.
     """
-    config = _refined(config)
+    config = refined(config)
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, camera.height, camera.width)
     entries, march = all_entries(impostor.mesh, tables, rays, config.march)
@@ -65,13 +65,17 @@ def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     return fit_capacities(impostor.mesh, tables, probe, config)
 
 
-def _refined(config: RenderConfig) -> RenderConfig:
+def refined(config: RenderConfig) -> RenderConfig:
     """With the steps of frames; once is enough."""
     factor, sampler = config.frame_refinement, config.sampler
     most = math.ceil(factor * sampler.max_samples_per_ray)
     mean = sampler.capacity_per_ray and math.ceil(factor * sampler.capacity_per_ray)
     sampler = dataclasses.replace(
-        sampler, step=sampler.step / factor, max_samples_per_ray=most, capacity_per_ray=mean
+        sampler,
+        step=sampler.step / factor,
+        cone_angle=sampler.cone_angle / factor**2,  # growth a step: of smaller steps, and of more of them
+        max_samples_per_ray=most,
+        capacity_per_ray=mean,
     )
     # A sample's weight is in proportion to its step.
     return dataclasses.replace(
@@ -95,7 +99,7 @@ def render_frame(
     coarse quadratures may miss the same detail. Samples below a 32nd of the tolerance are left out, and those
     below `min_weight`. Raises ValueError for a tolerance that is not positive.
     """
-    height, width, config = camera.height, camera.width, _refined(config)
+    height, width, config = camera.height, camera.width, refined(config)
     if tolerance is not None:
         if not tolerance > 0:
             raise ValueError(f"tolerance must be > 0, got {tolerance}")

@@ -58,18 +58,18 @@ def render_samples(
     capacity = slots * rays.origins.shape[0]
     segments = locate_segments(impostor.mesh, local, crossings, near, capacity)
     plan = plan_samples(segments, config.sampler, config.density_measure, jitter, refinement)
-    chosen, num_used = _occupied(impostor, plan, config)
+    chosen, num_used = occupied_samples(impostor, plan, config)
     features = None
     if config.min_weight > 0:
-        chosen, features, num_used = _visible(impostor, plan, chosen, num_used, config, refinement)
+        chosen, features, num_used = visible_samples(impostor, plan, chosen, num_used, config, refinement)
     samples = place_samples(plan, chosen, num_used)
-    return _integrate(impostor, local, samples, features, segments.overflow), samples
+    return integrate_samples(impostor, local, samples, features, segments.overflow), samples
 
 
-def _occupied(
+def occupied_samples(
     impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig
 ) -> tuple[Int[Array, " M"], Int[Array, ""]]:
-    """The samples in cells that may be seen; of rays that look everywhere, all."""
+    """Numbers of the samples in cells that may be seen, and how many; rays that look everywhere keep all."""
     everything = jnp.arange(plan.owners.size, dtype=jnp.int32)
     if not config.skip_empty or impostor.occupied is None:
         return everything, plan.num_used
@@ -89,13 +89,17 @@ def _looks_everywhere(jitter: Float[Array, " R"]) -> Bool[Array, " R"]:
     return (jitter * 1024) % 1 < 1 / 16
 
 
-def _integrate(
+def integrate_samples(
     impostor: NeuralImpostor,
     rays: Rays,
     samples: Samples,
     known_features: Float[Array, "M C"] | None,
-    overflow: Array,
+    overflow: Bool[Array, " R"],
 ) -> RenderOutput:
+    """Decode and composite samples of rays [R] in the mesh's own frame (Eqs. 7 to 9).
+
+    Features from `visible_samples` are not computed again. `overflow` is that of the segments.
+    """
     num_used = samples.num_used
     point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used, known_features)
     directions = field.encode_directions(impostor, rays.directions)
@@ -132,7 +136,7 @@ def _weights(sigmas: Float[Array, " M"], samples: Samples) -> Float[Array, " M"]
     return sample_weights(sigmas * samples.deltas, samples.rays, samples.num_used)
 
 
-def _visible(
+def visible_samples(
     impostor: NeuralImpostor,
     plan: SamplePlan,
     chosen: Int[Array, " M"],
@@ -140,11 +144,10 @@ def _visible(
     config: RenderConfig,
     refinement: Float[Array, " R"] | None,
 ) -> tuple[Int[Array, " M"], Float[Array, "M C"], Int[Array, ""]]:
-    """The samples that contribute at least `min_weight`, and their features: a pass without gradient.
+    """Those of the chosen samples that contribute at least `min_weight`, their features, and how many.
 
-    With finer steps, samples that contribute less in proportion are kept.
-
-    Colours and gradients cost several times a density; most samples lie in empty space or behind a surface.
+    A pass without gradient: colours and gradients cost several times a density, and most samples lie in empty
+    space or behind a surface. With finer steps, samples that contribute less in proportion are kept.
     """
     frozen, plan = jax.lax.stop_gradient((impostor, plan))
     samples = place_samples(plan, chosen, num_used)

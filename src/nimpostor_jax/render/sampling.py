@@ -84,7 +84,8 @@ def plan_samples(
 
     `jitter` in [0, 1) is one number a ray; its samples' places follow by golden-ratio steps, so that they
     depend neither on the batch around the ray nor on the number of devices. Steps are scaled down so that a
-    whole number of them fills the ray exactly. Empty rays get no samples. `refinement` divides a ray's steps.
+    whole number of them fills the ray exactly. Empty rays get no samples. `refinement` divides a ray's steps
+    (with cone growth, later ones by less).
     """
     num_rays, owners = segments.overflow.shape[0], segments.rays
     max_samples = config.max_samples_per_ray
@@ -131,8 +132,6 @@ def plan_samples(
 
 def place_samples(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]) -> Samples:
     """The first `num_used` of the chosen samples, which ascend; differentiable in the plan's segments."""
-    if not plan.owners.size:
-        chosen = chosen[:0]
     arrays = dataclasses.replace(plan, owners=None, overflow=None, coarsened=None)  # type: ignore[arg-type]
     columns = map_used(place, arrays, (chosen, plan.owners[chosen]), num_used)
     tet_ids, lambdas, t, deltas, rays = columns
@@ -149,7 +148,10 @@ def place_samples(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Arra
 
 
 def place(plan: SamplePlan, items: tuple[Int[Array, " M"], Int[Array, " M"]]) -> tuple[Array, ...]:
-    """Tets, coordinates, t, interval lengths and rays of samples, given with their segments (Eq. 5)."""
+    """Tets [M], coordinates [M, 4], t, interval lengths and rays [M] of samples (Eq. 5).
+
+    Samples are given by their numbers and segments. Reads neither `owners` nor the plan's flags.
+    """
     numbers, owners = items
     segments = plan.segments
     rays = segments.rays[owners]

@@ -78,7 +78,8 @@ def init_state(
     """
     parameters, last_seen = trainable(impostor), None
     if impostor.occupied is not None:
-        last_seen = jnp.where(impostor.occupied, 0, NEVER)
+        # Not weakly typed, or the second step would compile again.
+        last_seen = jnp.where(impostor.occupied, jnp.int32(0), jnp.int32(NEVER))
     elif cells_per_edge:
         num_tets = impostor.mesh.tets.shape[0]
         while cells_per_edge > 1 and num_tets * num_cells(cells_per_edge) > MAX_CELLS:

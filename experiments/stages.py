@@ -1,0 +1,144 @@
+"""CPU time of each stage of rendering and of a training step, on one device.
+
+    python experiments/stages.py --data=DIR --workdir=out/mic --out=stages.json
+
+Frame rays are a chunk of the first test view at 800 pixels, as `render_frame` takes them; training rays half
+a batch, as one of two devices has them. Stages are compiled one by one, so that their sum is not quite the
+whole. Medians, without compilation; `page_faults` should be 0 after the first call.
+"""
+
+import argparse
+import resource
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from benchmark import first_camera
+
+from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.io.impostor_file import load_impostor
+from nimpostor_jax.pipeline.evaluate import write_json
+from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
+from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order, to_local
+from nimpostor_jax.render.capacity import ray_entries
+from nimpostor_jax.render.frame import CHUNK, frame_config
+from nimpostor_jax.render.renderer import (
+    integrate_samples,
+    occupied_samples,
+    render_rays,
+    visible_samples,
+)
+from nimpostor_jax.render.sampling import place_samples, plan_samples
+from nimpostor_jax.render.segments import locate_segments
+from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
+from nimpostor_jax.train.pool import draw_batch
+from nimpostor_jax.train.step import RayBatch, loss_gradient, make_optimizer, trainable
+from nimpostor_jax.types import NeuralImpostor, Rays
+
+Row = dict[str, Any]
+
+FRAME_SIZE = 800
+REPEATS = 9
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--data", required=True, help="a nerf-synthetic folder, or a built-in scene")
+    parser.add_argument("--workdir", required=True, type=Path, help="of a training run")
+    parser.add_argument("--out", type=Path, default=Path("out/stages.json"))
+    add_flags(parser)
+    args = parser.parse_args(argv)
+    use_all_cores()
+    config = load_config([args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or [])
+    impostor = load_impostor(args.workdir / "impostor.npz")
+    scene = prepare(config, args.data, cage=args.workdir / "cage.npz", log=lambda _: None)
+    camera = first_camera(scene, FRAME_SIZE)
+    order = tile_order(camera.height, camera.width)
+    rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2)[order])
+    sized = frame_config(impostor, camera, config.render)
+    rows = render_stages("frame", impostor, chunk_of_hits(impostor, rays, sized), sized, None)
+    half = config.train.rays_per_batch // 2
+    batch = draw_batch(jax.random.key(0), 0, scene.pool, half, "random")
+    rows += render_stages("training", impostor, batch.rays, scene.render, batch.jitter)
+    rows += training_stages(impostor, batch, scene.render)
+    write_json(args.out, {"device": jax.devices()[0].device_kind, "rows": rows})
+    print(f"wrote {args.out}")
+
+
+def chunk_of_hits(impostor: NeuralImpostor, rays: Rays, config: RenderConfig) -> Rays:
+    """A chunk of a frame's rays that hit the cage, tile by tile from all over the image."""
+    tables = jax.jit(march_tables)(impostor.mesh)
+    hits = np.flatnonzero(np.asarray(ray_entries(impostor.mesh, tables, rays, config.march).holds)[:, 0] >= 0)
+    tile = 256
+    tiles = np.linspace(0, len(hits) // tile - 1, CHUNK // tile).round().astype(int)
+    chosen = hits[(tiles[:, None] * tile + np.arange(tile)).ravel()]
+    return jax.tree.map(lambda x: x[chosen], rays)
+
+
+def timed(kind: str, stage: str, function: Callable, *arguments: Any) -> tuple[Row, Any]:
+    """A row, and what the function returns."""
+    call = jax.jit(function)
+    result = jax.block_until_ready(call(*arguments))
+    times, faults = [], []
+    for _ in range(REPEATS):
+        before, start = resource.getrusage(resource.RUSAGE_SELF).ru_minflt, time.process_time()
+        jax.block_until_ready(call(*arguments))
+        times.append(time.process_time() - start)
+        faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    row = {"rays": kind, "stage": stage, "cpu_ms": 1e3 * float(np.median(times))}
+    row["page_faults"] = int(np.median(faults))
+    print(f"{kind:9s} {stage:12s} {row['cpu_ms']:8.2f} ms  {row['page_faults']} page faults", flush=True)
+    return row, result
+
+
+def render_stages(
+    kind: str, impostor: NeuralImpostor, rays: Rays, config: RenderConfig, jitter: jax.Array | None
+) -> list[Row]:
+    """Each stage of `render_rays`, and all of it with known entries."""
+    rows: list[Row] = []
+
+    def stage(name: str, function: Callable, *arguments: Any) -> Any:
+        row, result = timed(kind, name, function, *arguments)
+        rows.append(row)
+        return result
+
+    mesh, local = impostor.mesh, to_local(impostor.mesh, rays)
+    tables = jax.jit(march_tables)(mesh)
+    capacity = (config.march.capacity_per_ray or config.march.max_tets_per_ray) * rays.origins.shape[0]
+    entries = stage("entries", lambda t, r: find_entries(t, r, config.march), tables, local)
+    crossings = stage("march", lambda t, r, e: traverse(t, r, config.march, e), tables, local, entries)
+    segments = stage(
+        "segments", lambda m, r, c: locate_segments(m, r, c, 0.0, capacity), mesh, local, crossings
+    )
+    plan = stage("plan", lambda s: plan_samples(s, config.sampler, config.density_measure, jitter), segments)
+    chosen, count = stage("cells", lambda i, p: occupied_samples(i, p, config), impostor, plan)
+    numbers = {"planned": int(plan.num_used), "in occupied cells": int(count)}
+    chosen, features, count = stage(
+        "visible", lambda i, p, c, n: visible_samples(i, p, c, n, config, None), impostor, plan, chosen, count
+    )
+    samples = stage("place", place_samples, plan, chosen, count)
+    stage("colours", integrate_samples, impostor, local, samples, features, segments.overflow)
+    stage("all", lambda i, r, t, e: render_rays(i, r, config, jitter, t, e), impostor, rays, tables, entries)
+    print(f"{kind}: samples {numbers | {'visible': int(count)}}")
+    return [row | {"samples": numbers | {"visible": int(count)}} for row in rows]
+
+
+def training_stages(impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig) -> list[Row]:
+    """The gradient of a batch, and the optimiser's update."""
+    parameters, optimizer = trainable(impostor), make_optimizer()
+    gradient, (gradients, _) = timed(
+        "training", "gradient", lambda p, i, b: loss_gradient(p, i, b, config), parameters, impostor, batch
+    )
+    gradients = jax.tree.map(jnp.asarray, gradients)
+    update, _ = timed("training", "Adam", optimizer.update, gradients, optimizer.init(parameters), parameters)
+    return [gradient, update]
+
+
+if __name__ == "__main__":
+    run_cli(main)
