@@ -35,6 +35,16 @@ def quick_compilation(request):
     jax.config.update("jax_disable_most_optimizations", False)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """Free each module's compiled programs: they are thousands of memory maps, of which Linux allows 65,530.
+
+    Beyond, compiling ends in a segmentation fault.
+    """
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def optimized():
     """Compile this test's own programs (not those that other tests have compiled) as users do."""
