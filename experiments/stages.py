@@ -123,7 +123,11 @@ def render_stages(
         "visible", lambda i, p, c, n: visible_samples(i, p, c, n, config, None), impostor, plan, chosen, count
     )
     samples = stage("place", place_samples, plan, chosen, count)
-    stage("colours", integrate_samples, impostor, local, samples, features, segments.overflow)
+    stage(
+        "colours",
+        lambda i, r, s, f, o: integrate_samples(i, r, s, f, o, config),
+        impostor, local, samples, features, segments.overflow,
+    )  # fmt: skip
     stage("all", lambda i, r, t, e: render_rays(i, r, config, jitter, t, e), impostor, rays, tables, entries)
     print(f"{kind}: samples {numbers | {'visible': int(count)}}")
     return [row | {"samples": numbers | {"visible": int(count)}} for row in rows]

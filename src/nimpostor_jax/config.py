@@ -10,7 +10,7 @@ import types
 import typing
 from typing import Any, Literal, TypeVar
 
-Layout = Literal["per_simplex", "per_tet"]
+Layout = Literal["per_simplex", "per_tet", "box"]
 Interpolation = Literal["grid", "simplex"]
 Measure = Literal["barycentric", "alpha", "euclidean"]
 Background = Literal["white", "black", "random"]
@@ -28,7 +28,8 @@ class EncodingConfig:
 
     `layout` says who owns a grid node: `per_simplex` shares nodes on common vertices, edges and faces
     (continuous field), `per_tet` gives each tet its own table (the paper's). `interpolation` is the
-    16-corner 4D `grid` of the paper or the 4-corner `simplex` of the edgewise subdivision.
+    16-corner 4D `grid` of the paper or the 4-corner `simplex` of the edgewise subdivision. The layout `box`
+    is Instant-NGP's grid of Cartesian coordinates in the cage's bounding cube, with 8 or 4 corners.
     """
 
     layout: Layout = "per_simplex"
@@ -185,11 +186,17 @@ class RenderConfig:
     near: float = 0.0  # in world units
     min_weight: float = 1e-3  # samples that contribute less get no colour and no gradient; 0: all do
     skip_empty: bool = True  # leave out samples in cells that training found empty or hidden
+    explore: float = 1 / 16  # share of training's rays that look into all cells nevertheless
+    integrate: Literal["color", "features"] = "color"  # Eq. 9, or Eq. 10: one decoded colour a ray
     frame_refinement: float = 2.0  # divides the steps of frames; in training, jitter makes up for long steps
 
     def __post_init__(self) -> None:
         _require(0 <= self.min_weight < 1, self, "min_weight", "in [0, 1)")
         _require(self.frame_refinement >= 1, self, "frame_refinement", ">= 1")
+        _require(0 <= self.explore <= 1, self, "explore", "in [0, 1]")
+        _require(
+            self.integrate in ("color", "features"), self, "integrate", "'color' or 'features'"
+        )
         _require(
             self.density_measure in ("barycentric", "euclidean"),
             self,
@@ -225,14 +232,19 @@ class DataConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CageConfig:
-    """Cage construction from masks or from a surface mesh (Sec. 5.1)."""
+    """Cage construction from masks or from a surface mesh (Sec. 5.1).
 
+    `shape` is an `envelope` of the object, or its bounding `box` of 6 tets (NGP-Bounded).
+    """
+
+    shape: Literal["envelope", "box"] = "envelope"
     target_tets: int = 350
     grid_resolution: int = 128  # voxels along the longest side of the visual hull
     margin: float = 0.02  # offset of the envelope from the object, as a share of its diagonal
     max_missed_share: float = 0.001  # foreground pixels whose rays may miss the cage
 
     def __post_init__(self) -> None:
+        _require(self.shape in ("envelope", "box"), self, "shape", "'envelope' or 'box'")
         _require(self.target_tets >= 6, self, "target_tets", ">= 6")
         _require(self.grid_resolution >= 16, self, "grid_resolution", ">= 16")
         _require(0 < self.margin < 0.5, self, "margin", "in (0, 0.5)")
@@ -241,7 +253,11 @@ class CageConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Optimisation of tables and decoders."""
+    """Optimisation of tables and decoders.
+
+    `occupancy` says which cells hold something: those that rays have `seen` of late, or those whose
+    `density`, evaluated in turns, is not negligible (Instant-NGP's).
+    """
 
     steps: int = 2000
     rays_per_batch: int = 4096
@@ -249,6 +265,7 @@ class TrainConfig:
     final_learning_rate: float = 1e-3
     warmup_steps: int = 50
     background: Background = "random"
+    occupancy: Literal["seen", "density"] = "seen"
     cells_per_edge: int = 16  # of the occupancy grid in each tet; 0: no sample is left out
     forget_rays: int = 2_000_000  # rays after which a cell that none has seen counts as empty
     seed: int = 0
@@ -267,6 +284,9 @@ class TrainConfig:
             self,
             "background",
             f"one of {typing.get_args(Background)}",
+        )
+        _require(
+            self.occupancy in ("seen", "density"), self, "occupancy", "'seen' or 'density'"
         )
         _require(0 <= self.cells_per_edge <= 64, self, "cells_per_edge", "in [0, 64]")
         _require(self.forget_rays >= 1, self, "forget_rays", ">= 1")

@@ -95,11 +95,19 @@ class HashLayout:
 
 
 @struct.dataclass
+class BoxLayout:
+    """Instant-NGP's tables: one grid over the bounding cube of the cage at rest, for all tets."""
+
+    starts: Int[Array, " L+1"]  # first entry of each level, and the number of entries
+    corners: Float[Array, "T 4 3"]  # of the tets at rest, in units of the cube
+
+
+@struct.dataclass
 class HashTables:
     """Trainable features of all levels in one packed array, and the layout that addresses them."""
 
     features: Float[Array, "entries F"]
-    layout: HashLayout
+    layout: HashLayout | BoxLayout
 
 
 @struct.dataclass

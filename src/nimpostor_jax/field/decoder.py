@@ -51,6 +51,11 @@ def init_decoders(key: Array, config: ImpostorConfig, num_sets: int = 1) -> Para
     return parameters
 
 
+def num_decoder_sets(parameters: Parameters) -> int:
+    """D."""
+    return parameters["density"][0]["weight"].shape[0]
+
+
 def decode_density(
     parameters: Parameters, features: Float[Array, "M C"], decoder_ids: Int[Array, " M"]
 ) -> Float[Array, " M"]:

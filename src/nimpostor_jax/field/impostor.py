@@ -6,17 +6,23 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.config import ImpostorConfig
+from nimpostor_jax.encoding.box_grid import build_box_layout
 from nimpostor_jax.encoding.hash_grid import encode, init_features
 from nimpostor_jax.encoding.layout import build_layout
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.field.decoder import decode_appearance, decode_density, init_decoders
-from nimpostor_jax.types import HashTables, NeuralImpostor, TetMesh
+from nimpostor_jax.types import BoxLayout, HashLayout, HashTables, NeuralImpostor, TetMesh
 
 
 def init_impostor(key: Array, mesh: TetMesh, config: ImpostorConfig) -> NeuralImpostor:
     """An untrained impostor on a cage: packed tables, one decoder set. Host code: builds the layout."""
     table_key, decoder_key = jax.random.split(key)
-    layout = build_layout(np.asarray(mesh.tets), config.encoding)
+    tets = np.asarray(mesh.tets)
+    layout: HashLayout | BoxLayout = (
+        build_box_layout(np.asarray(mesh.vertices), tets, config.encoding)
+        if config.encoding.layout == "box"
+        else build_layout(tets, config.encoding)
+    )
     num_entries = int(layout.starts[-1])
     return NeuralImpostor(
         mesh=mesh,

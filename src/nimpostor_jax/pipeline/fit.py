@@ -37,6 +37,7 @@ from nimpostor_jax.train.step import (
     make_optimizer,
     occupied_cells,
     train_step,
+    update_thickness,
     with_parameters,
 )
 from nimpostor_jax.types import NeuralImpostor
@@ -86,7 +87,7 @@ def fit(
     config = scene.config.train
     devices = _usable_devices(config)
     optimizer = make_optimizer()
-    state = init_state(scene.impostor, optimizer, config.cells_per_edge)
+    state = init_state(scene.impostor, optimizer, config.cells_per_edge, config.occupancy)
     progress = Progress()
     checkpoints = Path(workdir) / "checkpoints" if workdir is not None else None
     identity = {"cage": cage_fingerprint(scene.impostor.mesh)}
@@ -115,6 +116,7 @@ def fit(
         train_step, optimizer=optimizer, forget_after=config.forget_after, gradient=gradient
     )
     compiled = jax.jit(step_function, static_argnames="config", donate_argnums=0)
+    update = jax.jit(partial(update_thickness, sampler=render.sampler), donate_argnums=1)
     key = jax.random.key(config.seed + 1)
     records = _LogFile(Path(workdir) / "log.csv" if workdir is not None else None, progress.step)
     bar = tqdm(
@@ -133,6 +135,8 @@ def fit(
     try:
         while (done := progress.share(config, max_minutes)) < 1:
             batch = place(draw_batch(key, progress.step, pool, config.rays_per_batch, config.background))
+            if config.occupancy == "density" and progress.step % _OCCUPANCY_EVERY == 0:
+                state = update(key, state, impostor)
             rate = learning_rate(config, done, progress.step)
             state, metrics = compiled(state, impostor, batch, jnp.asarray(rate, jnp.float32), config=render)
             progress.step += 1
@@ -164,6 +168,7 @@ def fit(
 
 
 _SYNC_EVERY = 8  # steps that may be under way at once
+_OCCUPANCY_EVERY = 16  # steps, as in Instant-NGP
 
 
 def _usable_devices(config: TrainConfig) -> Sequence[jax.Device]:

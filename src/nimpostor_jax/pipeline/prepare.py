@@ -17,6 +17,7 @@ from nimpostor_jax.io.blender import PosedImages, check_masks, load_scene
 from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.preprocess.cage import Cage, cage_from_images
+from nimpostor_jax.preprocess.proxies import bounding_box, box_cage
 from nimpostor_jax.preprocess.topology import build_tet_mesh
 from nimpostor_jax.preprocess.validate import (
     check_coverage,
@@ -154,12 +155,17 @@ def load_cage(
     cage_output: str | Path | None,
     log: Log,
 ) -> Cage:
-    """The given cage file, checked against the views' foreground; or one built from the views' masks."""
+    """The given cage file, checked against the views' foreground; or one built from the views' masks.
+
+    Where the config asks for a box, that around the given file's vertices.
+    """
     if cage is None:
         check_masks(train)
         vertices, tets = cage_from_images(train, config.cage, log)
     else:
         vertices, tets = load_tets(cage)
+        if config.cage.shape == "box":
+            vertices, tets = box_cage(bounding_box(vertices))
         check_tets(vertices, tets, str(cage))
         if train.has_alpha.all():
             views = (train.camera_to_world, train.focal, train.principal)

@@ -10,14 +10,16 @@ from typing import Protocol
 
 import numpy as np
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from nimpostor_jax.config import CageConfig
 from nimpostor_jax.preprocess import validate
 from nimpostor_jax.preprocess.envelope import envelope_from_grid, voxelize_surface
+from nimpostor_jax.preprocess.proxies import bounding_box, box_cage
 from nimpostor_jax.preprocess.surface import load_surface
 from nimpostor_jax.preprocess.tetrahedralize import Log, tetrahedralize
 from nimpostor_jax.preprocess.tighten import tighten
+from nimpostor_jax.preprocess.topology import Cage
 from nimpostor_jax.preprocess.visual_hull import OccupancyGrid, visual_hull
 
 _ATTEMPTS = 3
@@ -53,14 +55,11 @@ class PosedImages(Protocol):
         """Of the images, for messages."""
 
 
-Cage = tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 4"]]
-
-
 def cage_from_images(views: PosedImages, config: CageConfig = _DEFAULT, log: Log = print) -> Cage:
     """Vertices [V, 3] float64 and tets [T, 4] int32 around the object that the images' alpha shows.
 
-    Logs the calls, the report and the missed share. Enlarges the margin, twice at most, while rays
-    miss.
+    With `config.shape` "box", those of its bounding box. Logs the calls, the report and the missed
+    share. Enlarges the margin, twice at most, while rays miss.
 
     Raises:
         ValueError: an empty mask, masks that do not bound the object, a target far out of reach, or
@@ -120,14 +119,18 @@ def _build(
     diagonal = float(np.linalg.norm(np.diff(grid.bounds, axis=0)))
     margin = config.margin
     for attempt in range(_ATTEMPTS):
-        vertices, tets = tetrahedralize(
-            lambda offset, step: envelope_from_grid(grid, offset, step),
-            config.target_tets,
-            diagonal,
-            margin,
-            log,
-        )
-        vertices = tighten(vertices, tets, _required_points(grid, _TIGHT_SHARE * margin * diagonal))
+        required = _required_points(grid, _TIGHT_SHARE * margin * diagonal)
+        if config.shape == "box":
+            vertices, tets = box_cage(bounding_box(required))
+        else:
+            vertices, tets = tetrahedralize(
+                lambda offset, step: envelope_from_grid(grid, offset, step),
+                config.target_tets,
+                diagonal,
+                margin,
+                log,
+            )
+            vertices = tighten(vertices, tets, required)
         validate.check_tets(vertices, tets, source)
         report = validate.quality_report(vertices, tets)
         missed = coverage((vertices, tets))

@@ -7,6 +7,8 @@ from jaxtyping import Float, Int
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.types import BoundaryFaces, TetMesh
 
+Cage = tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 4"]]  # vertices and tets
+
 _FACE_CORNERS = np.array(FACES)
 TETS_PER_LEAF = 2
 MAX_FACE_CLUSTERS = 1 << 15

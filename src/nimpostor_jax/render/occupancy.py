@@ -6,7 +6,9 @@ with the tet. Training records when a cell last contributed to a pixel, and look
 Axes: T tets, C = N (N + 1) (N + 2) / 6 cells of a tet, M samples.
 """
 
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -35,6 +37,27 @@ def cell_index(
     k = jnp.minimum(k, plane)
     index = space * (space + 1) * (space + 2) // 6 + plane * (plane + 1) // 2 + k
     return tet_ids * cells + index
+
+
+def random_points(
+    key: Array, cell_ids: Int[Array, " M"], cells: int
+) -> tuple[Int[Array, " M"], Float[Array, "M 4"]]:
+    """A point in each of the given cells (indices into [T * C]): its tet, and its coordinates."""
+    resolution = cell_resolution(cells)
+    low = jnp.asarray(_corners(resolution), jnp.float32)[cell_ids % cells]
+    inside = jax.random.uniform(key, (cell_ids.size, 3))
+    # Cells at the face lambda_3 = 0 are cut off.
+    room, asked = resolution - jnp.sum(low, axis=1), jnp.sum(inside, axis=1)
+    inside *= jnp.minimum(1, room / jnp.maximum(asked, 1e-6))[:, None]
+    first = (low + inside) / resolution
+    last = jnp.maximum(1 - jnp.sum(first, axis=1, keepdims=True), 0)
+    return cell_ids // cells, jnp.concatenate([first, last], axis=1)
+
+
+def _corners(resolution: int) -> np.ndarray:
+    """Integer parts of N lambda_0, N lambda_1 and N lambda_2 by cell, [C, 3]: the inverse of `cell_index`."""
+    spaces = range(resolution)
+    return np.array([(s - p, p - k, k) for s in spaces for p in range(s + 1) for k in range(p + 1)])
 
 
 def in_occupied_cells(

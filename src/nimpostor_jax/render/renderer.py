@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nimpostor_jax.chunks import map_used, pack_where
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
+from nimpostor_jax.field.decoder import decode_appearance, num_decoder_sets
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sample_weights, sum_by_ray
 from nimpostor_jax.render.occupancy import in_occupied_cells
@@ -63,7 +64,7 @@ def render_samples(
     if config.min_weight > 0:
         chosen, features, num_used = visible_samples(impostor, plan, chosen, num_used, config, refinement)
     samples = place_samples(plan, chosen, num_used)
-    return integrate_samples(impostor, local, samples, features, segments.overflow), samples
+    return integrate_samples(impostor, local, samples, features, segments.overflow, config), samples
 
 
 def occupied_samples(
@@ -78,15 +79,15 @@ def occupied_samples(
         occupied, arrays = shared
         tet_ids, lambdas, _, _, rays = place(arrays, part)
         keep = in_occupied_cells(occupied, tet_ids, lambdas)
-        return keep if arrays.jitter is None else keep | _looks_everywhere(arrays.jitter)[rays]
+        return keep if arrays.jitter is None else keep | _explores(arrays.jitter, config.explore)[rays]
 
     frozen = jax.lax.stop_gradient(plan)
     return pack_where(test, (impostor.occupied, frozen), (everything, plan.owners), plan.num_used)
 
 
-def _looks_everywhere(jitter: Float[Array, " R"]) -> Bool[Array, " R"]:
-    """One ray in sixteen, by digits of its jitter that hardly move its samples: cells fill up."""
-    return (jitter * 1024) % 1 < 1 / 16
+def _explores(jitter: Float[Array, " R"], share: float) -> Bool[Array, " R"]:
+    """A share of the rays, by digits of their jitter that hardly move their samples: cells fill up."""
+    return (jitter * 1024) % 1 < share
 
 
 def integrate_samples(
@@ -95,23 +96,37 @@ def integrate_samples(
     samples: Samples,
     known_features: Float[Array, "M C"] | None,
     overflow: Bool[Array, " R"],
+    config: RenderConfig,
 ) -> RenderOutput:
-    """Decode and composite samples of rays [R] in the mesh's own frame (Eqs. 7 to 9).
+    """Decode and composite samples of rays [R] in the mesh's own frame (Eqs. 7, 9 and 10).
 
     Features from `visible_samples` are not computed again. `overflow` is that of the segments.
     """
     num_used = samples.num_used
     point_features = field.features(impostor, samples.tet_ids, samples.lambdas, num_used, known_features)
     directions = field.encode_directions(impostor, rays.directions)
-    items = (samples.tet_ids, point_features, samples.rays)
-    sigmas, colors = map_used(_decode, (_only_decoders(impostor), directions), items, num_used)
+    decoders, num_rays = _only_decoders(impostor), rays.origins.shape[0]
+    if config.integrate == "features":
+        sigmas = map_used(_density, decoders, (samples.tet_ids, point_features), num_used)
+        values = point_features
+    else:
+        items = (samples.tet_ids, point_features, samples.rays)
+        sigmas, values = map_used(_decode, (decoders, directions), items, num_used)
     weights = _weights(sigmas, samples)
-    values = jnp.column_stack([colors, jnp.ones_like(weights), samples.t])
-    sums = sum_by_ray(weights, values, samples.rays, rays.origins.shape[0], num_used)
-    opacity, depth = sums[:, 3], sums[:, 4]
+    values = jnp.column_stack([values, jnp.ones_like(weights), samples.t])
+    if config.integrate == "features":
+        num_sets = num_decoder_sets(impostor.decoders)
+        rows = samples.rays * num_sets + impostor.decoder_index[samples.tet_ids]
+        sums = sum_by_ray(weights, values, rows, num_rays * num_sets, num_used)
+        color = decode_integrated(impostor, sums[:, :-2], sums[:, -2], directions)
+        sums = jnp.sum(sums.reshape(num_rays, num_sets, -1), axis=1)
+    else:
+        sums = sum_by_ray(weights, values, samples.rays, num_rays, num_used)
+        color = sums[:, :-2]
+    opacity, depth = sums[:, -2], sums[:, -1]
     visible = opacity > 0
     return RenderOutput(
-        color=sums[:, :3],
+        color=color,
         opacity=opacity,
         depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * impostor.mesh.scale,
         overflow=overflow | samples.overflow,
@@ -119,9 +134,38 @@ def integrate_samples(
     )
 
 
+def decode_integrated(
+    impostor: NeuralImpostor,
+    features: Float[Array, "R*D C"],
+    weights: Float[Array, " R*D"],
+    directions: Float[Array, "R E"],
+) -> Float[Array, "R 3"]:
+    """Colour, times opacity, of rays from features summed by weight for each of D decoder sets (Eq. 10).
+
+    The decoder sees the weighted mean; what several sets see adds up.
+    """
+    visible = weights > 0
+    mean = jnp.where(visible, 1 / jnp.where(visible, weights, 1), 0)[:, None] * features
+    num_sets, num_rays = num_decoder_sets(impostor.decoders), directions.shape[0]
+    order = jnp.arange(num_rays * num_sets, dtype=jnp.int32)
+    shared, count = (impostor.decoders, directions), jnp.int32(order.size)
+    colors = map_used(_decode_mean, shared, (mean, order), count)
+    return jnp.sum((weights[:, None] * colors).reshape(num_rays, num_sets, 3), axis=1)
+
+
+def _decode_mean(shared: tuple, part: tuple) -> Float[Array, "chunk 3"]:
+    (decoders, directions), (features, order) = shared, part
+    num_sets = num_decoder_sets(decoders)
+    return decode_appearance(decoders, features, directions[order // num_sets], order % num_sets)
+
+
 def _only_decoders(impostor: NeuralImpostor) -> NeuralImpostor:
     """Without tables and mesh, or `map_used` would add up gradients of their size for every chunk."""
     return dataclasses.replace(impostor, mesh=None, tables=None, occupied=None)  # type: ignore[arg-type]
+
+
+def _density(decoders: NeuralImpostor, part: tuple) -> Float[Array, " chunk"]:
+    return field.density(decoders, *part)
 
 
 def _decode(shared: tuple, part: tuple) -> tuple[Array, Array]:
@@ -152,10 +196,7 @@ def visible_samples(
     frozen, plan = jax.lax.stop_gradient((impostor, plan))
     samples = place_samples(plan, chosen, num_used)
     features = field.features(frozen, samples.tet_ids, samples.lambdas, num_used)
-    sigmas = map_used(
-        lambda decoders, part: field.density(decoders, *part),
-        _only_decoders(frozen), (samples.tet_ids, features), num_used,
-    )  # fmt: skip
+    sigmas = map_used(_density, _only_decoders(frozen), (samples.tet_ids, features), num_used)
     least, weights = config.min_weight, _weights(sigmas, samples)
     if refinement is not None:
         weights *= refinement[samples.rays]

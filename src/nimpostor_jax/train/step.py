@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,11 @@ import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.config import RenderConfig, TrainConfig
+from nimpostor_jax.chunks import map_used
+from nimpostor_jax.config import RenderConfig, SamplerConfig, TrainConfig
+from nimpostor_jax.field import impostor as field
 from nimpostor_jax.render.composite import blend_background
-from nimpostor_jax.render.occupancy import cells_of, num_cells
+from nimpostor_jax.render.occupancy import cells_of, num_cells, random_points
 from nimpostor_jax.render.renderer import render_samples
 from nimpostor_jax.render.traverse import Entries
 from nimpostor_jax.train.losses import photometric
@@ -21,6 +23,8 @@ from nimpostor_jax.types import NeuralImpostor, Rays
 Parameters = dict[str, Any]
 Metrics = dict[str, Array]
 
+DECAY = 0.95  # of a cell's optical thickness between updates
+MIN_THICKNESS = 0.01  # of a step, below which a cell counts as empty
 NEVER = -(1 << 30)  # step of a cell that no ray has seen
 MAX_CELLS = 1 << 19  # of all tets: more would see too few rays before they are forgotten
 
@@ -44,6 +48,7 @@ class TrainState:
     optimizer: optax.OptState
     step: Int[Array, ""]
     last_seen: Int[Array, "T cells"] | None = None  # step at which a cell last contributed to a pixel
+    thickness: Float[Array, "T cells"] | None = None  # optical, of a step in the cell; slowly forgotten
 
 
 def trainable(impostor: NeuralImpostor) -> Parameters:
@@ -70,13 +75,16 @@ def learning_rate(config: TrainConfig, progress: float, step: int) -> float:
 
 
 def init_state(
-    impostor: NeuralImpostor, optimizer: optax.GradientTransformation, cells_per_edge: int = 0
+    impostor: NeuralImpostor,
+    optimizer: optax.GradientTransformation,
+    cells_per_edge: int = 0,
+    occupancy: Literal["seen", "density"] = "seen",
 ) -> TrainState:
     """The state before the first step. Of large cages, tets are cut into fewer cells than asked for.
 
     An impostor that has been trained already goes on with its own cells.
     """
-    parameters, last_seen = trainable(impostor), None
+    parameters, last_seen, thickness = trainable(impostor), None, None
     if impostor.occupied is not None:
         # Not weakly typed, or the second step would compile again.
         last_seen = jnp.where(impostor.occupied, jnp.int32(0), jnp.int32(NEVER))
@@ -85,16 +93,22 @@ def init_state(
         while cells_per_edge > 1 and num_tets * num_cells(cells_per_edge) > MAX_CELLS:
             cells_per_edge //= 2
         last_seen = jnp.zeros((num_tets, num_cells(cells_per_edge)), jnp.int32)
+    if occupancy == "density" and last_seen is not None:
+        thickness = jnp.where(last_seen == NEVER, 0, jnp.full(last_seen.shape, 2 * MIN_THICKNESS))
+        last_seen = None
     return TrainState(
         parameters=parameters,
         optimizer=optimizer.init(parameters),
         step=jnp.zeros((), jnp.int32),
         last_seen=last_seen,
+        thickness=thickness,
     )
 
 
 def occupied_cells(state: TrainState, forget_after: int) -> Bool[Array, "T cells"] | None:
-    """Cells that some ray saw within the last `forget_after` steps."""
+    """Cells that some ray saw within the last `forget_after` steps, or that have an optical thickness."""
+    if state.thickness is not None:
+        return state.thickness > jnp.minimum(MIN_THICKNESS, jnp.mean(state.thickness))
     return None if state.last_seen is None else state.last_seen + forget_after > state.step
 
 
@@ -147,9 +161,42 @@ def train_step(
     updates, optimizer_state = optimizer.update(gradients, state.optimizer, state.parameters)
     parameters = jax.tree.map(lambda p, u: p - rate * u, state.parameters, updates)
     last_seen = state.last_seen
-    if last_seen is not None:
-        seen = metrics.pop("seen_cells")
+    seen = metrics.pop("seen_cells", None)
+    if last_seen is not None and seen is not None:
         last_seen = jnp.where(seen > 0, state.step, last_seen)
-    return TrainState(
-        parameters=parameters, optimizer=optimizer_state, step=state.step + 1, last_seen=last_seen
-    ), metrics
+    state = dataclasses.replace(
+        state,
+        parameters=parameters,
+        optimizer=optimizer_state,
+        step=state.step + 1,
+        last_seen=last_seen,
+    )
+    return state, metrics
+
+
+def update_thickness(
+    key: Array, state: TrainState, impostor: NeuralImpostor, sampler: SamplerConfig
+) -> TrainState:
+    """Look into every second cell, in turns, at a random point (Instant-NGP, Appendix C).
+
+    A cell's thickness is the larger of what is found and of what has been known, a little forgotten. For
+    `measure` euclidean and density in the same measure: a step then is as long in all cells.
+    """
+    if state.thickness is None:
+        return state
+    impostor = with_parameters(impostor, state.parameters)
+    num_tets, cells = state.thickness.shape
+    key = jax.random.fold_in(key, state.step)
+    turn = jax.random.randint(key, (), 0, 2)
+    chosen = jnp.minimum(2 * jnp.arange((num_tets * cells + 1) // 2) + turn, num_tets * cells - 1)
+    tet_ids, lambdas = random_points(key, chosen, cells)
+    features = field.features(impostor, tet_ids, lambdas)
+    found = map_used(
+        lambda shared, part: field.density(shared, *part),
+        dataclasses.replace(impostor, mesh=None, tables=None, occupied=None),  # type: ignore[arg-type]
+        (tet_ids, features),
+        jnp.int32(chosen.size),
+    )
+    known = DECAY * state.thickness.reshape(-1)
+    thickness = known.at[chosen].max(sampler.step * found).reshape(num_tets, cells)
+    return dataclasses.replace(state, thickness=thickness)

@@ -1,0 +1,137 @@
+"""The methods that the paper's tables compare, trained or reused; and the tables' files."""
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.gin_flags import load_config, operative_config_text
+from nimpostor_jax.io.atomic import atomic_path
+from nimpostor_jax.io.images import composite
+from nimpostor_jax.io.impostor_file import load_impostor, save_impostor
+from nimpostor_jax.metrics import psnr
+from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
+from nimpostor_jax.pipeline.fit import fit
+from nimpostor_jax.pipeline.prepare import Scene, prepare
+from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.types import NeuralImpostor
+
+CONFIGS = Path(__file__).parent / "configs" / "ladder"
+METHODS = {
+    "NGP-Bounded": "ngp_bounded",
+    "BaryEnc": "bary_enc",
+    "BarySpl": "bary_spl",
+    "FeatInt": "feat_int",
+}
+CURVE_POINTS = 10  # of held-out PSNR against training time
+CURVE_VIEWS = 4
+# What --quick puts in the place of the defaults: every step of the script in a minute or two, for tests.
+QUICK = (
+    "CageConfig.target_tets=100",
+    "CageConfig.grid_resolution=48",
+    "SamplerConfig.max_samples_per_ray=64",
+    "TrainConfig.steps=20",
+    "TrainConfig.warmup_steps=5",
+    "TrainConfig.rays_per_batch=512",
+)
+QUICK_RESOLUTION = 24
+Row = dict[str, Any]
+
+
+class Trained(NamedTuple):
+    """A method's impostor on a scene, and its row of the table."""
+
+    scene: Scene
+    impostor: NeuralImpostor
+    row: Row
+
+
+def config_of(
+    method: str, resolution: int, configs: Sequence[Path], bindings: Sequence[str]
+) -> ExperimentConfig:
+    """A method's config at an image width; the caller's files and bindings come last."""
+    files = [CONFIGS / f"{METHODS[method]}.gin", *configs]
+    return load_config(files, [f"DataConfig.resolution={resolution}", *bindings])
+
+
+def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path, workdir: Path) -> Trained:
+    """Train a method on a scene, or take what an earlier run with the same config left in `workdir`.
+
+    `cage` is where all methods' cage is, or is put.
+    """
+    scene = prepare(config, data, cage=cage if cage.exists() else None, cage_output=cage)
+    settings, row_file, file = (workdir / name for name in ("config.gin", "row.json", "impostor.npz"))
+    text = operative_config_text(config)
+    if row_file.exists() and settings.read_text(encoding="utf-8") == text:
+        print(f"{workdir}: trained already")
+        return Trained(scene, load_impostor(file), json.loads(row_file.read_text(encoding="utf-8")))
+    views = scene.test.select(np.linspace(0, len(scene.test) - 1, CURVE_VIEWS).astype(int))
+    curve_file = workdir / "curve.json"  # of a run that was cut off, too
+    curve = json.loads(curve_file.read_text(encoding="utf-8")) if curve_file.exists() else []
+
+    def measure(impostor: NeuralImpostor, step: int) -> None:
+        sized = frame_config(impostor, camera_of(views, 0), config.render)
+        images = [to_image(render_frame(impostor, camera_of(views, i), sized)) for i in range(len(views))]
+        truths = [composite(truth, "white") for truth in views.images]
+        curve[:] = [point for point in curve if point[0] < step]
+        curve.append((step, float(np.mean([psnr(*pair) for pair in zip(images, truths, strict=True)]))))
+        write_json(curve_file, curve)
+
+    impostor, progress = fit(scene, workdir=workdir, callback=measure)
+    save_impostor(file, impostor)
+    result = evaluate(impostor, scene.test, config.render, pictures=workdir / "pictures")
+    with open(workdir / "log.csv", newline="", encoding="utf-8") as log:
+        seconds = {int(line["step"]): float(line["seconds"]) for line in csv.DictReader(log)}
+    row = {
+        "method": method,
+        "scene": Path(data).name,
+        "psnr": result["psnr"],
+        "ssim": result["ssim"],
+        "lpips": result["lpips"],
+        "train_seconds": progress.seconds,
+        "fps": 1 / result["seconds_per_frame"],
+        "resolution": scene.test.width,
+        "tets": len(scene.impostor.mesh.tets),
+        "parameters": int(scene.impostor.tables.features.size),
+        "steps": progress.step,
+        "rays_per_batch": config.train.rays_per_batch,
+        "curve": [(seconds[step], value) for step, value in curve],
+    }
+    with atomic_path(settings) as path:
+        path.write_text(text, encoding="utf-8")
+    write_json(row_file, row)
+    return Trained(scene, impostor, row)
+
+
+def seconds_to(curve: Sequence[tuple[float, float]], target: float) -> float | None:
+    """Training time after which a curve of (seconds, PSNR) reaches a PSNR for good; None if it does not."""
+    before = (0.0, 0.0)
+    for i, (seconds, value) in enumerate(curve):
+        if all(later >= target for _, later in curve[i:]):
+            share = (target - before[1]) / (value - before[1]) if value > before[1] else 1.0
+            return before[0] + min(max(share, 0.0), 1.0) * (seconds - before[0])
+        before = (seconds, value)
+    return None
+
+
+def write_table(out: Path, rows: Sequence[Row], columns: Sequence[str], notes: str) -> None:
+    """`out`.json with all of the rows; `out`.csv and `out`.md with the given columns."""
+    write_json(out.with_suffix(".json"), {"notes": notes, "rows": list(rows)})
+    cells = [[_text(row.get(column)) for column in columns] for row in rows]
+    with atomic_path(out.with_suffix(".csv")) as path, open(path, "w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([columns, *cells])
+    lines = [list(columns), ["---"] * len(columns), *cells]
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    with atomic_path(out.with_suffix(".md")) as path:
+        path.write_text(f"{table}\n\n{notes}\n", encoding="utf-8")
+    print(f"\n{table}\n\n{notes}\nwrote {out}.json, .csv, .md")
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,129 @@
+"""Table 2: quality and speed of the steps from Instant-NGP in a box to a baked, rasterized impostor.
+
+    python experiments/table2.py --scene DIR [DIR ...] --out=out/table2 --resolution 200 400
+    python experiments/table2.py --scene fluffy_ball --out=out/table2 --quick
+
+Every method is trained with the same cage, steps and batch, one after another; what an earlier run trained
+with the same settings is reused. Writes table2.json (`rows`), .csv, .md, and a picture of every method.
+`seconds_to_ngp` is the training time to NGP-Bounded's final PSNR on four held-out views, without compiling.
+"""
+
+import argparse
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from ladder import (
+    CURVE_POINTS,
+    METHODS,
+    QUICK,
+    QUICK_RESOLUTION,
+    Row,
+    Trained,
+    config_of,
+    seconds_to,
+    train_or_reuse,
+    write_table,
+)
+
+from nimpostor_jax.gin_flags import add_flags, run_cli
+from nimpostor_jax.io.images import composite, write_png
+from nimpostor_jax.pipeline.evaluate import camera_of
+from nimpostor_jax.pipeline.prepare import use_all_cores
+from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+
+# PSNR and SSIM, averages over the paper's scenes; training minutes on its GPU.
+PAPER = {
+    "nerf-synthetic": {
+        "NGP-Bounded": (36.545, 0.9810, 40.09),
+        "BaryEnc": (36.473, 0.9809, 36.72),
+        "BarySpl": (36.423, 0.9813, 30.63),
+        "FeatInt": (34.530, 0.9764, 29.17),
+        "Baked": (33.796, 0.9695, None),
+    },
+    "plush": {
+        "NGP-Bounded": (32.708, 0.9474, 44.65),
+        "BaryEnc": (32.843, 0.9470, 32.51),
+        "BarySpl": (32.915, 0.9477, 29.91),
+        "FeatInt": (32.797, 0.9393, 28.74),
+        "Baked": (32.249, 0.9370, None),
+    },
+}
+COLUMNS = (
+    "scene", "resolution", "method", "psnr", "ssim", "lpips", "train_seconds", "seconds_to_ngp", "fps",
+    "parameters", "paper_psnr", "paper_ssim",
+)  # fmt: skip
+
+
+def main(argv: Sequence[str]) -> None:
+    """Run the script."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scene", nargs="+", required=True, help="nerf-synthetic folders, or fluffy_ball")
+    parser.add_argument("--out", type=Path, required=True, help="folder of tables, pictures and trained runs")
+    parser.add_argument("--resolution", type=int, nargs="+", default=[200], help="image widths")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--cage", type=Path, nargs="*", default=[], help="of each scene; default: built")
+    parser.add_argument("--quick", action="store_true", help="small and short, to try the script")
+    add_flags(parser)
+    args = parser.parse_args(argv)
+    if args.cage and len(args.cage) != len(args.scene):
+        raise ValueError(f"{len(args.cage)} cages for {len(args.scene)} scenes; give one each, or none")
+    use_all_cores()
+    bindings = [*(QUICK if args.quick else ()), *args.gin_bindings]
+    rows: list[Row] = []
+    for i, scene in enumerate(args.scene):
+        for resolution in [QUICK_RESOLUTION] if args.quick else args.resolution:
+            folder = args.out / Path(scene).name
+            cage = args.cage[i] if args.cage else folder / "cage.npz"
+            trained = []
+            for method in args.methods:
+                config = config_of(method, resolution, args.gin_configs, bindings)
+                steps = max(1, config.train.steps // CURVE_POINTS)
+                config = config_of(
+                    method,
+                    resolution,
+                    args.gin_configs,
+                    [*bindings, f"TrainConfig.eval_every={steps}", f"TrainConfig.log_every={steps}"],
+                )
+                workdir = folder / f"{resolution}" / method
+                trained.append(train_or_reuse(method, config, scene, cage, workdir))
+            rows += compared(trained)
+            write_picture(folder / f"{resolution}.png", trained)
+            write_table(args.out / "table2", rows, COLUMNS, notes(rows))
+
+
+def compared(trained: Sequence[Trained]) -> list[Row]:
+    """The methods' rows, beside the paper's and with the time to NGP-Bounded's quality."""
+    rows = [dict(each.row) for each in trained]
+    furry = any(name in rows[0]["scene"] for name in ("plush", "fluffy"))
+    paper = PAPER["plush" if furry else "nerf-synthetic"]
+    ends = {row["method"]: row["curve"][-1][1] for row in rows}
+    for row in rows:
+        row["paper_psnr"], row["paper_ssim"], _ = paper[row["method"]]
+        if "NGP-Bounded" in ends:
+            row["seconds_to_ngp"] = seconds_to(row["curve"], ends["NGP-Bounded"])
+    return rows
+
+
+def notes(rows: Sequence[Row]) -> str:
+    """What the figures hold for."""
+    steps, rays = ({row[key] for row in rows} for key in ("steps", "rays_per_batch"))
+    return (
+        f"{sorted(steps)} steps of {sorted(rays)} rays on {len(os.sched_getaffinity(0))} cores; "
+        "fps: whole frames of held-out views. The paper's figures are averages over its scenes, 800x800."
+    )
+
+
+def write_picture(path: Path, trained: Sequence[Trained]) -> None:
+    """The first held-out view: truth, then every method."""
+    views = trained[0].scene.test
+    camera, images = camera_of(views, 0), [composite(views.images[0], "white")]
+    for each in trained:
+        sized = frame_config(each.impostor, camera, each.scene.config.render)
+        images.append(to_image(render_frame(each.impostor, camera, sized)))
+    write_png(path, np.concatenate(images, axis=1))
+
+
+if __name__ == "__main__":
+    run_cli(main)
