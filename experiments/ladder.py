@@ -1,24 +1,28 @@
 """The methods that the paper's tables compare, trained or reused; and the tables' files."""
 
 import csv
+import dataclasses
 import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.config import BakeConfig, ExperimentConfig
 from nimpostor_jax.gin_flags import load_config, operative_config_text
 from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.images import composite
-from nimpostor_jax.io.impostor_file import load_impostor, save_impostor
+from nimpostor_jax.io.impostor_file import load_baked, load_impostor, save_impostor
 from nimpostor_jax.metrics import psnr
+from nimpostor_jax.pipeline.bake import bake
 from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
 from nimpostor_jax.pipeline.fit import fit
 from nimpostor_jax.pipeline.prepare import Scene, prepare
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
-from nimpostor_jax.types import NeuralImpostor
+from nimpostor_jax.render.raster_frame import rasterize_frame
+from nimpostor_jax.types import BakedImpostor, NeuralImpostor
 
 CONFIGS = Path(__file__).parent / "configs" / "ladder"
 METHODS = {
@@ -37,6 +41,8 @@ QUICK = (
     "TrainConfig.steps=20",
     "TrainConfig.warmup_steps=5",
     "TrainConfig.rays_per_batch=512",
+    "BakeConfig.fit_rays=20000",
+    "BakeConfig.refine_steps=10",
 )
 QUICK_RESOLUTION = 24
 Row = dict[str, Any]
@@ -65,7 +71,7 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
     """
     scene = prepare(config, data, cage=cage if cage.exists() else None, cage_output=cage)
     settings, row_file, file = (workdir / name for name in ("config.gin", "row.json", "impostor.npz"))
-    text = operative_config_text(config)
+    text = operative_config_text(dataclasses.replace(config, bake=BakeConfig()))
     if row_file.exists() and settings.read_text(encoding="utf-8") == text:
         print(f"{workdir}: trained already")
         return Trained(scene, load_impostor(file), json.loads(row_file.read_text(encoding="utf-8")))
@@ -105,6 +111,43 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
         path.write_text(text, encoding="utf-8")
     write_json(row_file, row)
     return Trained(scene, impostor, row)
+
+
+def bake_or_reuse(trained: Trained, workdir: Path) -> tuple[BakedImpostor, Row]:
+    """Bake a method's impostor, or take what an earlier run left in `workdir`; and the row of the table."""
+    config = trained.scene.config
+    settings, row_file, file = (workdir / name for name in ("config.gin", "row.json", "baked.npz"))
+    text = operative_config_text(config)
+    if row_file.exists() and settings.read_text(encoding="utf-8") == text:
+        print(f"{workdir}: baked already")
+        return load_baked(file), json.loads(row_file.read_text(encoding="utf-8"))
+    start = time.perf_counter()
+    baked = bake(trained.impostor, trained.scene, config.bake)
+    seconds = time.perf_counter() - start
+    save_impostor(file, baked)
+    result = evaluate(baked, trained.scene.test, config.render, pictures=workdir / "pictures")
+    camera = camera_of(trained.scene.test, 0)
+    sized = frame_config(baked, camera, config.render)
+    rasterize_frame(baked, camera, sized)  # compiles
+    start = time.perf_counter()
+    raster = rasterize_frame(baked, camera, sized)
+    fps = 1 / (time.perf_counter() - start)
+    difference = np.abs(to_image(raster) - to_image(render_frame(baked, camera, sized))).mean()
+    row = {key: value for key, value in trained.row.items() if key != "curve"} | {
+        "method": "Baked",
+        "psnr": result["psnr"],
+        "ssim": result["ssim"],
+        "lpips": result["lpips"],
+        "bake_seconds": seconds,
+        "fps": 1 / result["seconds_per_frame"],
+        "raster_fps": fps,
+        "raster_difference": float(difference),
+        "parameters": int(baked.textures.features.size),
+    }
+    with atomic_path(settings) as path:
+        path.write_text(text, encoding="utf-8")
+    write_json(row_file, row)
+    return baked, row
 
 
 def seconds_to(curve: Sequence[tuple[float, float]], target: float) -> float | None:

@@ -301,6 +301,40 @@ class TrainConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class BakeConfig:
+    """Baking onto face textures (Sec. 3.4).
+
+    The cage's tets are first halved until their edges are about `tet_pixels` long in the training views: a
+    texture blurs what lies deep behind its face. `basis` is how a texel depends on the direction: not at all,
+    or linearly in the barycentric coordinates at which the ray leaves the tet. After the fit to what single
+    tets show, `refine_steps` of training improve the textures (and with `refine_decoders` the decoders) on
+    whole pictures.
+    """
+
+    tet_pixels: float = 6.0
+    texels_per_pixel: float = 0.7  # along an edge, at the training views' distance
+    max_resolution: int = 256  # texels along an edge
+    min_opacity: float = 2e-3  # of a tet, on average over the light that reaches it; less is left out
+    basis: Literal["constant", "linear"] = "linear"
+    max_megabytes: int = 2048  # of textures; more is refused
+    fit_rays: int = 2_000_000
+    refine_steps: int = 500
+    refine_decoders: bool = True
+    learning_rate: float = 5e-3
+
+    def __post_init__(self) -> None:
+        _require(self.tet_pixels > 0, self, "tet_pixels", "> 0")
+        _require(self.texels_per_pixel > 0, self, "texels_per_pixel", "> 0")
+        _require(0 <= self.min_opacity < 1, self, "min_opacity", "in [0, 1)")
+        _require(1 <= self.max_resolution <= 4096, self, "max_resolution", "in [1, 4096]")
+        _require(self.basis in ("constant", "linear"), self, "basis", "'constant' or 'linear'")
+        _require(self.max_megabytes >= 1, self, "max_megabytes", ">= 1")
+        _require(self.fit_rays >= 1, self, "fit_rays", ">= 1")
+        _require(self.refine_steps >= 0, self, "refine_steps", ">= 0")
+        _require(self.learning_rate > 0, self, "learning_rate", "> 0")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ExperimentConfig:
     """One run: what the scripts read from gin files and save beside the checkpoint."""
 
@@ -309,6 +343,7 @@ class ExperimentConfig:
     impostor: ImpostorConfig = ImpostorConfig()
     render: RenderConfig = RenderConfig()
     train: TrainConfig = TrainConfig()
+    bake: BakeConfig = BakeConfig()
 
 
 Config = TypeVar("Config")

@@ -103,11 +103,19 @@ class BoxLayout:
 
 
 @struct.dataclass
+class FaceLayout:
+    """Triangular textures, one for each face of each tet: n + 1 texels along an edge, (n + 1)(n + 2) / 2."""
+
+    starts: Int[Array, "T 4"]  # first texel of the face opposite each corner
+    resolutions: Int[Array, "T 4"]  # n
+
+
+@struct.dataclass
 class HashTables:
     """Trainable features of all levels in one packed array, and the layout that addresses them."""
 
     features: Float[Array, "entries F"]
-    layout: HashLayout | BoxLayout
+    layout: HashLayout | BoxLayout | FaceLayout
 
 
 @struct.dataclass
@@ -120,6 +128,22 @@ class NeuralImpostor:
     decoder_index: Int[Array, " T"]  # which decoder set a tet uses
     config: ImpostorConfig = struct.field(pytree_node=False)
     occupied: Bool[Array, "T cells"] | None = None  # cells of `render.occupancy` that may be seen; None: all
+
+
+@struct.dataclass
+class BakedImpostor:
+    """An impostor whose tets are reduced to textures on their faces (Sec. 3.4): nothing is sampled any more.
+
+    A texel holds what a ray that enters there gathers in the tet: opacity, opacity times the share of the
+    segment at which it is seen, and the integrated features; each as K coefficients, of 1, or of the
+    barycentric coordinates at which the ray leaves.
+    """
+
+    mesh: TetMesh
+    textures: HashTables  # features [texels, K * (2 + C)], layout FaceLayout
+    decoders: dict[str, Any]
+    decoder_index: Int[Array, " T"]
+    config: ImpostorConfig = struct.field(pytree_node=False)
 
 
 @struct.dataclass

@@ -65,7 +65,7 @@ def rewrite_header(path, change):
         (lambda h: h["structure"].update(record="Popen"), "'Popen'"),
         (
             lambda h: h.update(structure=h["structure"]["fields"]["mesh"]),
-            "a TetMesh, not an impostor",
+            "a TetMesh, not a NeuralImpostor",
         ),
         (
             lambda h: h["structure"]["fields"]["decoder_index"].update(array="gone"),

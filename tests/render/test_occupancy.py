@@ -18,6 +18,7 @@ from nimpostor_jax.render.occupancy import (
     cells_of,
     in_occupied_cells,
     num_cells,
+    random_points,
 )
 from nimpostor_jax.render.renderer import render_rays, render_samples
 
@@ -103,3 +104,12 @@ def test_with_jitter_some_rays_look_into_empty_cells():
         jitter = jnp.asarray(rng.uniform(size=COUNT), jnp.float32)
         seeing += int(np.sum(render(blind, rays, RENDER, jitter).opacity > 0))
     assert 0.02 < seeing / (20 * COUNT) < 0.12  # a sixteenth of 640: 0.0625 with 0.0096 standard deviation
+
+
+def test_random_points_lie_in_their_cells():
+    cells = num_cells(5)
+    wanted = jnp.asarray(np.tile(np.arange(3 * cells), 4), jnp.int32)
+    tets, lambdas = random_points(jax.random.key(0), wanted, cells)
+    assert_array_equal(cell_index(tets, lambdas, cells), wanted)
+    np.testing.assert_allclose(np.sum(lambdas, axis=1), 1, atol=1e-6)
+    assert np.min(lambdas) >= 0

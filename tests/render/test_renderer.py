@@ -42,7 +42,10 @@ def mlp(layers, x):
 
 
 def render_loop(impostor, config, origin, direction):
-    """One ray in plain loops: brute-force segments, equal barycentric steps, the oracles' field."""
+    """One ray in plain loops: brute-force segments, equal barycentric steps, the oracles' field.
+
+    Colours are decoded at each sample, or once from the mean feature (Eq. 10), as the config says.
+    """
     vertices, tets = local_vertices(impostor.mesh)
     segments = oracles.ray_segments(vertices, tets, origin, direction)
     extents = np.array([np.abs(s[4] - s[3]).sum() for s in segments])
@@ -50,7 +53,7 @@ def render_loop(impostor, config, origin, direction):
         return np.zeros(3), 0.0, 0.0
     count = int(np.ceil(extents.sum() / config.sampler.step))
     delta, ends = extents.sum() / count, np.cumsum(extents)
-    sigmas, colors, ts = [], [], []
+    sigmas, colors, points, ts = [], [], [], []
     view = np.asarray(spherical_harmonics(jnp.asarray(direction), impostor.config.decoder.sh_degree))
     for i in range(count):
         position = (i + 0.5) * delta
@@ -65,17 +68,23 @@ def render_loop(impostor, config, origin, direction):
             enter + share * (leave - enter),
         )
         sigmas.append(np.exp(mlp(impostor.decoders["density"], point)[0]))
+        points.append(point)
         colors.append(logistic(mlp(impostor.decoders["appearance"], np.append(point, view))))
         ts.append(low + share * (high - low))
     weights = oracles.composite(sigmas, np.full(count, delta))
     opacity = weights.sum()
-    return weights @ np.array(colors), opacity, weights @ np.array(ts) / opacity * float(impostor.mesh.scale)
+    color = weights @ np.array(colors)
+    if config.integrate == "features":
+        mean = weights @ np.array(points) / opacity
+        color = opacity * logistic(mlp(impostor.decoders["appearance"], np.append(mean, view)))
+    return color, opacity, weights @ np.array(ts) / opacity * float(impostor.mesh.scale)
 
 
-def test_agrees_with_a_loop_over_samples(x64):
+@pytest.mark.parametrize("integrate", ["color", "features"])
+def test_agrees_with_a_loop_over_samples(integrate, x64):
     impostor = scenes.impostor("blobs", "float64")
     config = dataclasses.replace(
-        exact(max_samples_per_ray=64),
+        exact(max_samples_per_ray=64, integrate=integrate),
         march=dataclasses.replace(RENDER.march, max_tets_per_ray=24, max_entries_per_ray=3),
     )
     rays = rays_at(impostor)
@@ -117,6 +126,21 @@ def test_constant_density_has_the_analytic_opacity(measure, x64):
         assert_allclose(output.opacity[ray], -np.expm1(-np.exp(bias) * total), atol=1e-10)
 
 
+def test_integrated_features_are_decoded_once_for_each_decoder_set(x64):
+    """With constant colours, a ray's is their mean by weight, whichever way it is integrated."""
+    impostor = scenes.impostor("blobs", "float64")
+    decoders = jax.tree.map(lambda x: jnp.concatenate([x, x]), impostor.decoders)
+    last = jax.tree.map(jnp.zeros_like, decoders["appearance"][-1])
+    last["bias"] += jnp.array([[0.5, -1.0, 2.0], [-2.0, 0.3, 0.0]])
+    decoders["appearance"] = [*decoders["appearance"][:-1], last]
+    index = jnp.arange(len(impostor.mesh.tets), dtype=jnp.int32) % 2
+    mixed = impostor.replace(decoders=decoders, decoder_index=index)
+    rays = as_rays(rays_at(mixed), "float64")
+    outputs = [render(mixed, rays, exact(integrate=way)) for way in ("color", "features")]
+    assert_allclose(outputs[0].color, outputs[1].color, atol=1e-12)
+    assert np.std(np.asarray(outputs[0].color) / np.asarray(outputs[0].opacity)[:, None], axis=0).min() > 0.01
+
+
 def flatten(tree):
     """A pytree of float arrays as one vector, and the way back."""
     return jax.flatten_util.ravel_pytree(tree)
@@ -130,14 +154,14 @@ GRADIENT_TARGETS = {
 
 
 @functools.cache
-def gradient_scene():
+def gradient_scene(integrate="color"):
     impostor = scenes.impostor(dtype="float64")
     camera = scenes.camera(4, 3, dtype="float64")
     mix = jnp.asarray(np.random.default_rng(2).normal(size=(12, 5)))
 
     def objective(impostor, matrix):
         rays = pixel_rays(camera.replace(camera_to_world=matrix), image_pixels(3, 4).reshape(-1, 2))
-        output = render_rays(impostor, rays, exact(step=0.7))
+        output = render_rays(impostor, rays, exact(step=0.7, integrate=integrate))
         return jnp.sum(mix * jnp.column_stack([output.color, output.opacity, output.depth]))
 
     return impostor, camera, jax.jit(objective), jax.jit(jax.grad(objective, argnums=(0, 1), allow_int=True))
@@ -155,9 +179,10 @@ def check_directions(function, x, gradient, count=3):
         assert_allclose(jnp.vdot(slope, direction), expected, rtol=1e-5, atol=1e-8)
 
 
+@pytest.mark.parametrize("integrate", ["color", "features"])
 @pytest.mark.parametrize("target", GRADIENT_TARGETS)
-def test_gradients_match_finite_differences(target, x64):
-    impostor, camera, objective, gradient = gradient_scene()
+def test_gradients_match_finite_differences(target, integrate, x64):
+    impostor, camera, objective, gradient = gradient_scene(integrate)
     by_impostor, _ = gradient(impostor, camera.camera_to_world)
     parts = {
         "tables": (impostor.tables.features, by_impostor.tables.features),

@@ -56,7 +56,7 @@ class BoxGrid:
 
     def prepare(self, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]) -> Points:
         """What every level needs of points in tets."""
-        return Points(tet_ids=tet_ids, coordinates=self.coordinates(tet_ids, lambdas), multipliers=())
+        return Points(tet_ids=tet_ids, coordinates=self.coordinates(tet_ids, lambdas), places=())
 
     def coordinates(self, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]) -> Coordinates:
         """Cartesian, in the cage at rest, in units of the cube."""

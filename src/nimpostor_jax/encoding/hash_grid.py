@@ -21,10 +21,12 @@ from jaxtyping import Array, Float, Int
 from nimpostor_jax.chunks import default_chunk, for_chunks, pad_items, put, take
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.box_grid import BoxGrid
+from nimpostor_jax.encoding.face_grid import FaceGrid
 from nimpostor_jax.encoding.interpolation import Coordinates, Corners, Grid, Node, Points
 from nimpostor_jax.encoding.tet_grid import TetGrid
-from nimpostor_jax.types import BoxLayout, HashLayout, HashTables
+from nimpostor_jax.types import BoxLayout, FaceLayout, HashLayout, HashTables
 
+Layout = HashLayout | BoxLayout | FaceLayout
 _CornersOf = Callable[[Coordinates], Corners]
 _AddressOf = Callable[[Points, Node], Int[Array, " M"]]
 
@@ -61,7 +63,7 @@ def _encode(
     config: EncodingConfig,
     chunk: int,
     features: Float[Array, "entries F"],
-    layout: HashLayout | BoxLayout,
+    layout: Layout,
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""],
@@ -151,10 +153,11 @@ def _encode_backward(
 _encode.defvjp(_encode_forward, _encode_backward, symbolic_zeros=True)
 
 
-def _grid_of(config: EncodingConfig, layout: HashLayout | BoxLayout) -> Grid:
+def _grid_of(config: EncodingConfig, layout: Layout) -> Grid:
     """Which nodes are near a point, and where their features are stored."""
-    grid = BoxGrid if isinstance(layout, BoxLayout) else TetGrid
-    return grid(config, layout)  # type: ignore[arg-type]
+    if isinstance(layout, FaceLayout):
+        return FaceGrid(config, layout)
+    return BoxGrid(config, layout) if isinstance(layout, BoxLayout) else TetGrid(config, layout)
 
 
 def _points(

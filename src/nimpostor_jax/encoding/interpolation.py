@@ -22,7 +22,7 @@ class Points:
 
     tet_ids: Int[Array, " M"]
     coordinates: Coordinates
-    multipliers: tuple[UInt[Array, " M"], ...]  # hash factors of the coordinates where these are the points'
+    places: tuple[Int[Array, " M"] | UInt[Array, " M"], ...]  # what else addresses depend on
 
 
 class Grid(Protocol):

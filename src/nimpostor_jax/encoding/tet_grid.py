@@ -41,7 +41,7 @@ class TetGrid:
         """What every level needs of points in tets."""
         multipliers = tuple(self.layout.multipliers[:, i][tet_ids] for i in range(4))
         return Points(
-            tet_ids=tet_ids, coordinates=self.coordinates(tet_ids, lambdas), multipliers=multipliers
+            tet_ids=tet_ids, coordinates=self.coordinates(tet_ids, lambdas), places=multipliers
         )
 
     def coordinates(self, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]) -> Coordinates:
@@ -85,7 +85,7 @@ class TetGrid:
     ) -> Int[Array, " M"]:
         """Table entries of nodes at a hashed level."""
         region = self._region(level, points, node)
-        mixed = [u.astype(jnp.uint32) * m for u, m in zip(node, points.multipliers, strict=True)]
+        mixed = [u.astype(jnp.uint32) * m for u, m in zip(node, points.places, strict=True)]
         hashed = (mixed[0] ^ mixed[1]) ^ (mixed[2] ^ mixed[3])
         log2 = (region & ((1 << SIZE_BITS) - 1)).astype(jnp.uint32)
         local = (hashed & ((jnp.uint32(1) << log2) - 1)).astype(jnp.int32)

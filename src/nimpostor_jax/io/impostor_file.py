@@ -8,7 +8,7 @@ import json
 import zipfile
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,9 @@ import numpy as np
 from nimpostor_jax import types
 from nimpostor_jax.config import ImpostorConfig, from_dict, to_dict
 from nimpostor_jax.io.atomic import atomic_path
-from nimpostor_jax.types import NeuralImpostor
+from nimpostor_jax.types import BakedImpostor, NeuralImpostor
+
+Impostor = TypeVar("Impostor", NeuralImpostor, BakedImpostor)
 
 _FORMAT = "nimpostor_jax.NeuralImpostor"
 _FORMAT_VERSION = 2  # 1 had one array of features a level
@@ -35,8 +37,8 @@ _RECORDS: dict[str, Any] = {
 }
 
 
-def save_impostor(path: str | Path, impostor: NeuralImpostor) -> None:
-    """Write an impostor as a self-contained `.npz`: arrays by their path, and a JSON header.
+def save_impostor(path: str | Path, impostor: NeuralImpostor | BakedImpostor) -> None:
+    """Write an impostor, baked or not, as a self-contained `.npz`: arrays by their path, and a JSON header.
 
     The header holds the format's version, the configuration and the pytree's structure. The file
     appears whole or not at all. Raises ValueError for another suffix and for decoders with anything
@@ -60,9 +62,19 @@ def save_impostor(path: str | Path, impostor: NeuralImpostor) -> None:
 def load_impostor(path: str | Path) -> NeuralImpostor:
     """Read what `save_impostor` wrote; every array has the bits and dtype that it had.
 
-    Raises FileNotFoundError for a missing file, ValueError for one that is not an impostor file, is
-    damaged, is of another version, or holds float64 while jax runs without `jax_enable_x64`.
+    Raises FileNotFoundError for a missing file, ValueError for one that is not an impostor file, holds a
+    baked impostor, is damaged, is of another version, or holds float64 while jax runs without
+    `jax_enable_x64`.
     """
+    return _load(path, NeuralImpostor)
+
+
+def load_baked(path: str | Path) -> BakedImpostor:
+    """As `load_impostor`, of a baked one."""
+    return _load(path, BakedImpostor)
+
+
+def _load(path: str | Path, cls: type[Impostor]) -> Impostor:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"impostor file {path} does not exist")
@@ -86,8 +98,8 @@ def load_impostor(path: str | Path) -> NeuralImpostor:
         impostor = _unpack(header["structure"], stored, config)
     except (LookupError, TypeError, ValueError) as error:
         raise ValueError(f"{path} cannot be read as an impostor: {error}") from error
-    if not isinstance(impostor, NeuralImpostor):
-        raise ValueError(f"{path} holds a {type(impostor).__name__}, not an impostor")
+    if not isinstance(impostor, cls):
+        raise ValueError(f"{path} holds a {type(impostor).__name__}, not a {cls.__name__}")
     return impostor
 
 
@@ -97,7 +109,7 @@ def _pack(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return None
     if type(node) in _RECORDS.values():
         names = [field.name for field in dataclasses.fields(node)]
-        if type(node) is NeuralImpostor:
+        if type(node) in (NeuralImpostor, BakedImpostor):
             names.remove("config")  # in the header
         parts = {name: _pack(getattr(node, name), f"{path}/{name}", arrays) for name in names}
         return {"record": type(node).__name__, "fields": parts}
@@ -135,7 +147,8 @@ def _unpack(spec: Any, arrays: dict[str, np.ndarray], config: ImpostorConfig) ->
     if "record" in spec:
         cls = _RECORDS[spec["record"]]
         fields = {name: _unpack(part, arrays, config) for name, part in spec["fields"].items()}
-        return cls(**fields, config=config) if cls is NeuralImpostor else cls(**fields)
+        configured = cls in (NeuralImpostor, BakedImpostor)
+        return cls(**fields, config=config) if configured else cls(**fields)
     if "dict" in spec:
         return {key: _unpack(part, arrays, config) for key, part in spec["dict"].items()}
     kind = list if "list" in spec else tuple

@@ -18,7 +18,7 @@ from nimpostor_jax.io.blender import PosedImages
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.lpips import MIN_SIDE as LPIPS_MIN_SIDE
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
-from nimpostor_jax.types import Camera, NeuralImpostor
+from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor
 
 Log = Callable[[str], None]
 
@@ -29,7 +29,7 @@ def camera_of(views: PosedImages, index: int) -> Camera:
 
 
 def evaluate(
-    impostor: NeuralImpostor,
+    impostor: NeuralImpostor | BakedImpostor,
     views: PosedImages,
     config: RenderConfig,
     *,

@@ -13,11 +13,12 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Bool, Float
 
 from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.render.baked import render_baked_rays
 from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, all_entries, fit_capacities, grow_march, ray_entries
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables
-from nimpostor_jax.types import Camera, NeuralImpostor, Rays, RenderOutput
+from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor, Rays, RenderOutput
 
 CHUNK = 8192  # rays a call
 MAX_REFINEMENT = 32  # of the steps, to meet a tolerance
@@ -46,7 +47,9 @@ def _tiled_pixels(height: int, width: int) -> jax.Array:
     return image_pixels(height, width).reshape(-1, 2)[tile_order(height, width)]
 
 
-def frame_config(impostor: NeuralImpostor, camera: Camera, config: RenderConfig) -> RenderConfig:
+def frame_config(
+    impostor: NeuralImpostor | BakedImpostor, camera: Camera, config: RenderConfig
+) -> RenderConfig:
     """`config` with a frame's steps and buffers that fit this camera's view; use it for a whole animation.
 
     Sizes are measured on pixels spread over those that hit the cage. What overflows nevertheless,
@@ -84,9 +87,12 @@ def refined(config: RenderConfig) -> RenderConfig:
 
 
 def render_frame(
-    impostor: NeuralImpostor, camera: Camera, config: RenderConfig, tolerance: float | None = None
+    impostor: NeuralImpostor | BakedImpostor,
+    camera: Camera,
+    config: RenderConfig,
+    tolerance: float | None = None,
 ) -> Frame:
-    """Render one camera.
+    """Render one camera, of a baked impostor by marching through its tets.
 
     Only pixels whose rays hit the cage are shaded, `CHUNK` at a time, so memory does not grow with the image
     beyond its rays and output; a chunk's rays are split over all local devices. Rays whose buffers overflow
@@ -136,13 +142,13 @@ def render_frame(
 class View:
     """A camera's rays, and `render_rays` of any of them on all local devices, compiled once."""
 
-    def __init__(self, impostor: NeuralImpostor, camera: Camera, config: RenderConfig):
+    def __init__(self, impostor: NeuralImpostor | BakedImpostor, camera: Camera, config: RenderConfig):
         self._impostor, self._config = impostor, config
         self._tables = _march_tables(impostor.mesh)
         self._rays = _tiled_rays(camera, camera.height, camera.width)
         self._entries = ray_entries(impostor.mesh, self._tables, self._rays, config.march)
         self.hits = np.flatnonzero(np.asarray(self._entries.holds)[:, 0] >= 0)
-        mesh = _device_mesh()
+        mesh = device_mesh()
         self._num_devices = mesh.size
         self._replicas = jax.device_put((impostor, self._tables), NamedSharding(mesh, P()))
         self._by_ray = NamedSharding(mesh, P("rays"))
@@ -150,7 +156,7 @@ class View:
     def render(self, pixels: np.ndarray, refinement: int = 1) -> dict[str, np.ndarray]:
         """Outputs [len(pixels), ...] by name, with steps divided by `refinement`."""
         config, chunk, first = self._config, CHUNK * self._num_devices, True
-        results = _empty_outputs(len(pixels), self._impostor.mesh.vertices.dtype)
+        results = empty_outputs(len(pixels), self._impostor.mesh.vertices.dtype)
         pending = np.arange(len(pixels))
         for _ in range(MAX_GROWTH + 1):
             # Finer steps need more room: fewer rays share the buffers, so that nothing compiles again.
@@ -193,7 +199,8 @@ class View:
         return _render_sharded(*self._replicas, *placed, config)
 
 
-def _empty_outputs(count: int, dtype: np.dtype) -> dict[str, np.ndarray]:
+def empty_outputs(count: int, dtype: np.dtype) -> dict[str, np.ndarray]:
+    """What rays that hit nothing see, [count, ...] by the name of `RenderOutput`'s fields."""
     return {
         "color": np.zeros((count, 3), dtype),
         "opacity": np.zeros(count, dtype),
@@ -203,34 +210,33 @@ def _empty_outputs(count: int, dtype: np.dtype) -> dict[str, np.ndarray]:
 
 
 @cache
-def _device_mesh() -> Mesh:
+def device_mesh() -> Mesh:
+    """All local devices in a row, over which rays are split."""
     devices = jax.local_devices()
     return jax.make_mesh((len(devices),), ("rays",), axis_types=(AxisType.Auto,), devices=devices)
 
 
 @partial(jax.jit, static_argnames="config")
 def _render_sharded(
-    impostor: NeuralImpostor,
+    impostor: NeuralImpostor | BakedImpostor,
     tables: MarchTables,
     rays: Rays,
     entries: Entries,
     refinement: Float[jax.Array, " R"],
     config: RenderConfig,
 ) -> RenderOutput:
-    @partial(
-        jax.shard_map,
-        mesh=_device_mesh(),
-        in_specs=(P(), P(), P("rays"), P("rays"), P("rays")),
-        out_specs=P("rays"),
-        check_vma=False,
-    )
+    specs = (P(), P(), P("rays"), P("rays"), P("rays"))
+
+    @partial(jax.shard_map, mesh=device_mesh(), in_specs=specs, out_specs=P("rays"), check_vma=False)
     def shard(
-        impostor: NeuralImpostor,
+        impostor: NeuralImpostor | BakedImpostor,
         tables: MarchTables,
         rays: Rays,
         entries: Entries,
         refinement: Float[jax.Array, " R"],
     ) -> RenderOutput:
+        if isinstance(impostor, BakedImpostor):
+            return render_baked_rays(impostor, rays, config, tables, entries)
         return render_rays(impostor, rays, config, tables=tables, entries=entries, refinement=refinement)
 
     return shard(impostor, tables, rays, entries, refinement)

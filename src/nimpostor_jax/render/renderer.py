@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nimpostor_jax.chunks import map_used, pack_where
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
-from nimpostor_jax.field.decoder import decode_appearance, num_decoder_sets
+from nimpostor_jax.field.decoder import Parameters, decode_appearance, num_decoder_sets
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sample_weights, sum_by_ray
 from nimpostor_jax.render.occupancy import in_occupied_cells
@@ -118,15 +118,13 @@ def integrate_samples(
         num_sets = num_decoder_sets(impostor.decoders)
         rows = samples.rays * num_sets + impostor.decoder_index[samples.tet_ids]
         sums = sum_by_ray(weights, values, rows, num_rays * num_sets, num_used)
-        color = decode_integrated(impostor, sums[:, :-2], sums[:, -2], directions)
-        sums = jnp.sum(sums.reshape(num_rays, num_sets, -1), axis=1)
+        sums = decode_integrated(impostor.decoders, sums, directions)
     else:
         sums = sum_by_ray(weights, values, samples.rays, num_rays, num_used)
-        color = sums[:, :-2]
-    opacity, depth = sums[:, -2], sums[:, -1]
+    opacity, depth = sums[:, 3], sums[:, 4]
     visible = opacity > 0
     return RenderOutput(
-        color=color,
+        color=sums[:, :3],
         opacity=opacity,
         depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * impostor.mesh.scale,
         overflow=overflow | samples.overflow,
@@ -135,22 +133,20 @@ def integrate_samples(
 
 
 def decode_integrated(
-    impostor: NeuralImpostor,
-    features: Float[Array, "R*D C"],
-    weights: Float[Array, " R*D"],
-    directions: Float[Array, "R E"],
-) -> Float[Array, "R 3"]:
-    """Colour, times opacity, of rays from features summed by weight for each of D decoder sets (Eq. 10).
+    decoders: Parameters, sums: Float[Array, "R*D C+2"], directions: Float[Array, "R E"]
+) -> Float[Array, "R 5"]:
+    """Colours, opacity and depth of rays, from sums by weight for each of D decoder sets (Eq. 10).
 
-    The decoder sees the weighted mean; what several sets see adds up.
+    Summed are features, 1, and t. The decoder sees the weighted mean; what several sets see adds up.
     """
+    weights = sums[:, -2]
     visible = weights > 0
-    mean = jnp.where(visible, 1 / jnp.where(visible, weights, 1), 0)[:, None] * features
-    num_sets, num_rays = num_decoder_sets(impostor.decoders), directions.shape[0]
+    mean = jnp.where(visible, 1 / jnp.where(visible, weights, 1), 0)[:, None] * sums[:, :-2]
+    num_sets, num_rays = num_decoder_sets(decoders), directions.shape[0]
     order = jnp.arange(num_rays * num_sets, dtype=jnp.int32)
-    shared, count = (impostor.decoders, directions), jnp.int32(order.size)
-    colors = map_used(_decode_mean, shared, (mean, order), count)
-    return jnp.sum((weights[:, None] * colors).reshape(num_rays, num_sets, 3), axis=1)
+    colors = map_used(_decode_mean, (decoders, directions), (mean, order), jnp.int32(order.size))
+    values = jnp.column_stack([weights[:, None] * colors, sums[:, -2:]])
+    return jnp.sum(values.reshape(num_rays, num_sets, 5), axis=1)
 
 
 def _decode_mean(shared: tuple, part: tuple) -> Float[Array, "chunk 3"]:

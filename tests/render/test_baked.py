@@ -1,0 +1,171 @@
+"""render.baked and render.rasterize: textures on faces, marched and rasterized."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import scenes
+from meshes import local_vertices
+from numpy.testing import assert_allclose, assert_array_equal
+from rays import as_rays, generic, missing
+from scenes import exact
+from scenes_baked import baked as baked_scene
+
+from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
+from nimpostor_jax.geometry.tetrahedron import FACES
+from nimpostor_jax.render.baked import render_baked_rays
+from nimpostor_jax.render.frame import frame_config, render_frame
+from nimpostor_jax.render.raster_frame import rasterize_frame
+from nimpostor_jax.types import TetMesh
+
+COUNT = 16
+MARCH = dataclasses.replace(exact().march, max_tets_per_ray=24, max_entries_per_ray=3)
+CONFIG = dataclasses.replace(exact(), march=MARCH)
+render = jax.jit(render_baked_rays, static_argnames="config")
+
+
+def rays_at(impostor, kind=generic, seed=0):
+    """World rays for a mesh."""
+    origins, directions = kind(*local_vertices(impostor.mesh), np.random.default_rng(seed), COUNT)
+    center, scale = np.asarray(impostor.mesh.center), float(impostor.mesh.scale)
+    return as_rays((center + scale * origins, directions), impostor.mesh.vertices.dtype)
+
+
+def texel_lookup(baked, tet, enter, leave):
+    """One ray's channels in one tet, by loops: three texels, K basis functions."""
+    layout, table = baked.textures.layout, np.asarray(baked.textures.features, np.float64)
+    face = int(np.argmin(enter))
+    n, start = int(layout.resolutions[tet, face]), int(layout.starts[tet, face])
+    a, b, _ = (enter[i] for i in FACES[face])
+    scaled = n * np.array([a, a + b])
+    low = np.clip(np.floor(scaled), 0, n - 1).astype(int)
+    f = scaled - low
+    order = [1, 0] if f[1] >= f[0] else [0, 1]
+    node, total = low.copy(), 0
+    ends = [1, *f[order], 0]
+    for step in range(3):
+        total = total + (ends[step] - ends[step + 1]) * table[start + node[1] * (node[1] + 1) // 2 + node[0]]
+        if step < 2:
+            node[order[step]] += 1
+    total = total.reshape(-1, 2 + baked.config.encoding.feature_dim)
+    return total[0] if len(total) == 1 else leave @ total
+
+
+def mlp(layers, x):
+    for layer in layers[:-1]:
+        x = np.maximum(x @ np.asarray(layer["weight"][0]) + np.asarray(layer["bias"][0]), 0)
+    return x @ np.asarray(layers[-1]["weight"][0]) + np.asarray(layers[-1]["bias"][0])
+
+
+@pytest.mark.parametrize("num_basis", [1, 4])
+def test_agrees_with_a_loop_over_tets(num_basis, x64):
+    baked = baked_scene(dtype="float64", num_basis=num_basis)
+    rays = rays_at(baked)
+    output = render(baked, rays, CONFIG)
+    vertices, tets = local_vertices(baked.mesh)
+    center, scale = np.asarray(baked.mesh.center), float(baked.mesh.scale)
+    for ray in range(COUNT):
+        origin = (np.asarray(rays.origins[ray]) - center) / scale
+        light, sums, depth, opacity = 1.0, 0.0, 0.0, 0.0
+        for low, high, tet, enter, leave in oracles.ray_segments(
+            vertices, tets, origin, np.asarray(rays.directions[ray])
+        ):
+            channels = texel_lookup(baked, tet, enter, leave)
+            sums = sums + light * channels[2:]
+            opacity += light * channels[0]
+            depth += light * (channels[0] * low + channels[1] * (high - low))
+            light *= 1 - channels[0]
+        view = np.asarray(spherical_harmonics(rays.directions[ray], baked.config.decoder.sh_degree))
+        color = 1 / (1 + np.exp(-mlp(baked.decoders["appearance"], np.append(sums / opacity, view))))
+        # a few hundred float64 operations
+        assert_allclose(output.opacity[ray], opacity, atol=1e-9)
+        assert_allclose(output.color[ray], opacity * color, atol=1e-9)
+        assert_allclose(output.depth[ray], depth / opacity * scale, atol=1e-8)
+    assert np.std(output.opacity) > 0.01
+
+
+def test_rays_that_miss_are_exactly_transparent():
+    baked = baked_scene()
+    output = render(baked, rays_at(baked, missing), CONFIG)
+    for value in (output.color, output.opacity, output.depth):
+        assert_array_equal(value, np.zeros_like(value))
+
+
+@pytest.mark.parametrize("which", ["textures", "vertices"])
+def test_gradients_agree_with_differences(which, x64, rng):
+    """In texels everywhere; in vertices while entry points stay in their texels."""
+    baked = baked_scene("cube", "float64", opacity=(0.2, 0.6))
+    rays, weights = rays_at(baked), jnp.asarray(rng.normal(size=(COUNT, 5)))
+
+    def replaced(values):
+        if which == "vertices":
+            return baked.replace(mesh=baked.mesh.replace(vertices=values))
+        return baked.replace(textures=baked.textures.replace(features=values))
+
+    @jax.jit
+    def value(values):
+        output = render_baked_rays(replaced(values), rays, CONFIG)
+        shown = jnp.column_stack([output.color, output.opacity, output.depth])
+        return jnp.sum(weights * shown)
+
+    start = baked.mesh.vertices if which == "vertices" else baked.textures.features
+    direction = jnp.asarray(rng.normal(size=start.shape))
+    expected = oracles.directional_difference(value, start, direction)
+    found = float(jnp.sum(jax.grad(value)(start) * direction))
+    assert_allclose(found, expected, rtol=1e-5, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def frames():
+    """The same camera's picture, marched and rasterized; not a multiple of the tile, and cut at the edge."""
+    baked = baked_scene()
+    camera = scenes.camera(50, 37, position=(3.0, 2.0, 2.4), target=(0.9, 0.5, 0.4))
+    config = frame_config(baked, camera, CONFIG)
+    return baked, camera, config, render_frame(baked, camera, config), rasterize_frame(baked, camera, config)
+
+
+def assert_same_picture(one, other):
+    """Equal but for pixels that see an edge: one in a thousand may look past it on the other side."""
+    for name in ("color", "opacity", "depth"):
+        a, b = getattr(one, name), getattr(other, name)
+        off = np.abs(a - b) > 1e-4 * max(1, np.abs(a).max())  # sums of float32 in another order
+        assert np.mean(off) < 2e-3, name
+        assert a.max() > 0.3
+
+
+def test_rasterized_and_marched_pictures_are_the_same(frames):
+    _, _, _, marched, rasterized = frames
+    assert rasterized.color.shape == (37, 50, 3)
+    assert_same_picture(marched, rasterized)
+
+
+def test_the_order_of_tets_does_not_matter(frames):
+    baked, camera, config, _, rasterized = frames
+    order = np.random.default_rng(1).permutation(len(baked.mesh.tets))
+    layout, mesh = baked.textures.layout, baked.mesh
+    shuffled = baked.replace(
+        mesh=TetMesh(**{**mesh.__dict__, "tets": mesh.tets[order], "object_ids": mesh.object_ids[order]}),
+        textures=baked.textures.replace(
+            layout=layout.replace(starts=layout.starts[order], resolutions=layout.resolutions[order])
+        ),
+    )
+    again = rasterize_frame(shuffled, camera, config)
+    for name in ("color", "opacity", "depth"):
+        assert_allclose(getattr(again, name), getattr(rasterized, name), atol=1e-5)
+
+
+def test_too_few_layers_are_found_out_and_repaired(frames):
+    baked, camera, config, _, rasterized = frames
+    march = dataclasses.replace(config.march, max_tets_per_ray=2, capacity_per_ray=None)
+    again = rasterize_frame(baked, camera, dataclasses.replace(config, march=march))
+    assert_allclose(again.color, rasterized.color, atol=1e-5)
+
+
+def test_a_camera_within_the_cage_is_refused(frames):
+    baked, _, config, _, _ = frames
+    inside = scenes.camera(50, 37, position=(0.5, 0.5, 0.5), target=(0.9, 0.5, 0.4))
+    with pytest.raises(ValueError, match=r"not in front of the camera; first: .*use render_frame"):
+        rasterize_frame(baked, inside, config)
