@@ -13,7 +13,7 @@ import numpy as np
 from nimpostor_jax.config import BakeConfig, ExperimentConfig
 from nimpostor_jax.gin_flags import load_config, operative_config_text
 from nimpostor_jax.io.atomic import atomic_path
-from nimpostor_jax.io.images import composite
+from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import load_baked, load_impostor, save_impostor
 from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.bake import bake
@@ -159,6 +159,16 @@ def seconds_to(curve: Sequence[tuple[float, float]], target: float) -> float | N
             return before[0] + min(max(share, 0.0), 1.0) * (seconds - before[0])
         before = (seconds, value)
     return None
+
+
+def write_picture(path: Path, trained: Sequence[Trained]) -> None:
+    """The first held-out view: truth, then every method."""
+    views = trained[0].scene.test
+    camera, images = camera_of(views, 0), [composite(views.images[0], "white")]
+    for each in trained:
+        sized = frame_config(each.impostor, camera, each.scene.config.render)
+        images.append(to_image(render_frame(each.impostor, camera, sized)))
+    write_png(path, np.concatenate(images, axis=1))
 
 
 def write_table(out: Path, rows: Sequence[Row], columns: Sequence[str], notes: str) -> None:

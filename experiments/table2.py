@@ -14,7 +14,6 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 from ladder import (
     CURVE_POINTS,
     METHODS,
@@ -25,14 +24,12 @@ from ladder import (
     config_of,
     seconds_to,
     train_or_reuse,
+    write_picture,
     write_table,
 )
 
 from nimpostor_jax.gin_flags import add_flags, run_cli
-from nimpostor_jax.io.images import composite, write_png
-from nimpostor_jax.pipeline.evaluate import camera_of
 from nimpostor_jax.pipeline.prepare import use_all_cores
-from nimpostor_jax.render.frame import frame_config, render_frame, to_image
 
 # PSNR and SSIM, averages over the paper's scenes; training minutes on its GPU.
 PAPER = {
@@ -119,16 +116,6 @@ def notes(rows: Sequence[Row]) -> str:
         f"{sorted(steps)} steps of {sorted(rays)} rays on {len(os.sched_getaffinity(0))} cores; "
         "fps: whole frames of held-out views. The paper's figures are averages over its scenes, 800x800."
     )
-
-
-def write_picture(path: Path, trained: Sequence[Trained]) -> None:
-    """The first held-out view: truth, then every method."""
-    views = trained[0].scene.test
-    camera, images = camera_of(views, 0), [composite(views.images[0], "white")]
-    for each in trained:
-        sized = frame_config(each.impostor, camera, each.scene.config.render)
-        images.append(to_image(render_frame(each.impostor, camera, sized)))
-    write_png(path, np.concatenate(images, axis=1))
 
 
 if __name__ == "__main__":

@@ -4,24 +4,29 @@ import jax.numpy as jnp
 import numpy as np
 import scenes
 
-from nimpostor_jax.encoding.face_grid import build_face_layout, num_texels
+from nimpostor_jax.encoding.face_grid import NO_TEXELS, build_face_layout, num_texels
 from nimpostor_jax.types import BakedImpostor, HashTables
 
 
-def baked(name="blobs", dtype="float32", num_basis=4, seed=0, opacity=(0.0, 1.0)):
-    """Textures of 1 to 8 texels along an edge, opacities between the given ones."""
+def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), empty=0.2):
+    """Textures of 1 to 8 texels along an edge, opacities between the given ones; some tets without."""
     made = scenes.impostor(name, dtype)
     rng = np.random.default_rng(seed)
     resolutions = rng.integers(1, 9, (len(made.mesh.tets), 4))
-    channels = 2 + made.config.encoding.feature_dim
-    texels = rng.normal(size=(int(num_texels(resolutions).sum()), num_basis, channels))
-    texels[..., 0] = rng.uniform(*opacity, texels.shape[:2])
-    texels[..., 1] = texels[..., 0] * rng.uniform(size=texels.shape[:2])
-    texels[..., 2:] *= texels[..., :1]
-    features = jnp.asarray(texels.reshape(len(texels), -1), dtype)
+    resolutions[rng.uniform(size=len(resolutions)) < empty] = 0
+    layout = build_face_layout(resolutions)
+    count = NO_TEXELS + int(num_texels(resolutions[resolutions > 0]).sum())
+
+    def tables(texels):
+        return HashTables(features=jnp.asarray(texels.reshape(count, -1), dtype), layout=layout)
+
+    seen = rng.uniform(*opacity, (count, 4, 1))
+    depths = np.concatenate([seen, seen * rng.uniform(size=seen.shape)], axis=2)
+    features = rng.normal(size=(count, 4, made.config.encoding.feature_dim))
     return BakedImpostor(
         mesh=made.mesh,
-        textures=HashTables(features=features, layout=build_face_layout(resolutions)),
+        depths=tables(depths),
+        textures=tables(np.concatenate([seen, seen * features], axis=2)),
         decoders=made.decoders,
         decoder_index=made.decoder_index,
         config=made.config,

@@ -305,17 +305,14 @@ class BakeConfig:
     """Baking onto face textures (Sec. 3.4).
 
     The cage's tets are first halved until their edges are about `tet_pixels` long in the training views: a
-    texture blurs what lies deep behind its face. `basis` is how a texel depends on the direction: not at all,
-    or linearly in the barycentric coordinates at which the ray leaves the tet. After the fit to what single
-    tets show, `refine_steps` of training improve the textures (and with `refine_decoders` the decoders) on
-    whole pictures.
+    texture blurs what lies deep behind its face. After the fit to what single tets show, `refine_steps` of
+    training improve the textures (and with `refine_decoders` the decoders) on whole pictures.
     """
 
     tet_pixels: float = 6.0
     texels_per_pixel: float = 0.7  # along an edge, at the training views' distance
     max_resolution: int = 256  # texels along an edge
     min_opacity: float = 2e-3  # of a tet, on average over the light that reaches it; less is left out
-    basis: Literal["constant", "linear"] = "linear"
     max_megabytes: int = 2048  # of textures; more is refused
     fit_rays: int = 2_000_000
     refine_steps: int = 500
@@ -327,7 +324,6 @@ class BakeConfig:
         _require(self.texels_per_pixel > 0, self, "texels_per_pixel", "> 0")
         _require(0 <= self.min_opacity < 1, self, "min_opacity", "in [0, 1)")
         _require(1 <= self.max_resolution <= 4096, self, "max_resolution", "in [1, 4096]")
-        _require(self.basis in ("constant", "linear"), self, "basis", "'constant' or 'linear'")
         _require(self.max_megabytes >= 1, self, "max_megabytes", ">= 1")
         _require(self.fit_rays >= 1, self, "fit_rays", ">= 1")
         _require(self.refine_steps >= 0, self, "refine_steps", ">= 0")

@@ -134,13 +134,12 @@ class NeuralImpostor:
 class BakedImpostor:
     """An impostor whose tets are reduced to textures on their faces (Sec. 3.4): nothing is sampled any more.
 
-    A texel holds what a ray that enters there gathers in the tet: opacity, opacity times the share of the
-    segment at which it is seen, and the integrated features; each as K coefficients, of 1, or of the
-    barycentric coordinates at which the ray leaves.
+    A texel has four coefficients for each number, of the barycentric coordinates at which the ray leaves.
     """
 
     mesh: TetMesh
-    textures: HashTables  # features [texels, K * (2 + C)], layout FaceLayout
+    depths: HashTables  # features [texels, 4 * 2]: opacity, and opacity times where on the way it is seen
+    textures: HashTables  # features [texels, 4 * (1 + C)]: opacity, and integrated features; same FaceLayout
     decoders: dict[str, Any]
     decoder_index: Int[Array, " T"]
     config: ImpostorConfig = struct.field(pytree_node=False)

@@ -100,7 +100,7 @@ def test_gradients_agree_with_differences(interpolation, x64, rng):
     gradients = jax.jit(jax.grad(value, argnums=(0, 1)))(*arguments)
     for which, direction in enumerate(jnp.asarray(rng.normal(size=x.shape)) for x in arguments):
         steps = [
-            value(*(x + sign * 1e-7 * direction * (i == which) for i, x in enumerate(arguments)))
+            value(*(x + sign * 1e-7 * direction if i == which else x for i, x in enumerate(arguments)))
             for sign in (-1, 1)
         ]
         expected = (steps[1] - steps[0]) / 2e-7

@@ -18,26 +18,31 @@ from nimpostor_jax.io.blender import PosedImages
 from nimpostor_jax.pipeline.prepare import Log, Scene
 from nimpostor_jax.preprocess.subdivide import subdivide
 from nimpostor_jax.preprocess.topology import build_tet_mesh, world_vertices
-from nimpostor_jax.render.baked import HEAD
+from nimpostor_jax.render.baked import BASIS
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.frame import refined
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.bake import (
     FineCage,
-    add_moments,
+    Moments,
+    add_contents,
+    add_depths,
+    add_visible,
+    baked_parameters,
     no_moments,
     refine_step,
     solve_moments,
-    visible_opacity,
+    with_baked_parameters,
 )
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
 from nimpostor_jax.train.step import RayBatch, make_optimizer
-from nimpostor_jax.types import BakedImpostor, HashTables, NeuralImpostor
+from nimpostor_jax.types import BakedImpostor, HashTables, NeuralImpostor, TetMesh
 
 FIT_RAYS = 8192  # a call
 FIT_REFINEMENT = 4.0  # of training's steps: tets are small, and each should get some samples
+LOOK_SHARE, DEPTHS_SHARE = 0.25, 0.5  # of the rays: for what is visible at all, and how deep it lies
 FINAL_RATE = 0.1  # of the learning rate, at the end of the refinement
-DECODER_RATE = 0.2  # of the textures' learning rate
+RATES = {"depths": 1.0, "textures": 1.0, "decoders": 0.2}  # shares of it
 
 
 def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log = print) -> BakedImpostor:
@@ -47,70 +52,95 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     gather in each of the others, and refines them on the training views. Raises ValueError where the textures
     would need more than `max_megabytes`, or faces have no area.
     """
-    coarse, train = scene.impostor.mesh, scene.config.train
-    vertices, tets = world_vertices(coarse), np.asarray(coarse.tets)
-    pixels = face_pixels(vertices, tets, scene.train)
-    times = max(0, math.ceil(math.log2(np.median(pixels) / config.tet_pixels)))
-    fine = subdivide(vertices, tets, times)
-    mesh = build_tet_mesh(fine.vertices, fine.tets)
-    cage = FineCage(
-        mesh=mesh,
-        parents=jnp.asarray(fine.parents, jnp.int32),
-        lambdas=jnp.asarray(fine.lambdas, jnp.float32),
-    )
+    cage, pixels = fine_cage(scene, config)
+    train, mesh = scene.config.train, cage.mesh
     pool, _ = build_pool(mesh, scene.train.cameras, scene.train.images, scene.config.render.march)
     key = jax.random.key(train.seed + 2)
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
-    render = dataclasses.replace(scene.config.render, frame_refinement=FIT_REFINEMENT)
-    march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.holds.shape[1])
-    render = refined(dataclasses.replace(render, march=march))
-    render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, render)
+    render = fit_config(mesh, pool, probe, scene.config.render)
 
-    def batches(num_rays: int, text: str) -> Iterator[RayBatch]:
-        rays = len(probe.jitter)
-        for i in tqdm(range(-(-num_rays // rays)), desc=text, unit="batch", disable=None):
-            yield draw_batch(key, i, pool, rays, "white")
+    def batches(share: float, text: str) -> Iterator[RayBatch]:
+        count = -(-round(share * config.fit_rays) // len(probe.jitter))
+        for i in tqdm(range(count), desc=text, unit="batch", disable=None):
+            yield draw_batch(key, i, pool, len(probe.jitter), "white")
 
-    found = jnp.zeros((len(fine.tets), 2))
-    look = jax.jit(visible_opacity, static_argnames="config", donate_argnums=0)
-    for batch in batches(config.fit_rays // 4, "look"):
-        found = look(found, impostor, cage, batch, config=render)
+    add = {
+        function: jax.jit(function, static_argnames="config", donate_argnums=0)
+        for function in (add_visible, add_depths, add_contents)
+    }
+    found = jnp.zeros((len(mesh.tets), 2))
+    for batch in batches(LOOK_SHARE, "look"):
+        found = add[add_visible](found, impostor, cage, batch, config=render)
     light, taken = np.asarray(found).T
-    shown = taken > config.min_opacity * np.maximum(light, 1e-3)
-    resolutions = np.clip(
-        np.ceil(config.texels_per_pixel * face_pixels(fine.vertices, fine.tets, scene.train)),
-        1,
-        config.max_resolution,
-    ).astype(np.int64)
-    resolutions[~shown] = 0
+    shown = taken > config.min_opacity * np.maximum(light, 1)
+    resolutions = np.clip(np.ceil(config.texels_per_pixel * pixels), 1, config.max_resolution)
+    resolutions = np.where(shown[:, None], resolutions, 0).astype(np.int64)
+    num_features = impostor.config.encoding.feature_dim
+    counts = checked_texels(resolutions, BASIS * (3 + num_features), config, log)
+    faces = np.concatenate([np.zeros(NO_TEXELS, int), np.repeat(np.arange(counts.size), counts)])
+    layout = build_face_layout(resolutions)
 
-    num_basis = 4 if config.basis == "linear" else 1
-    num_channels = HEAD + impostor.config.encoding.feature_dim
+    def tables(moments: Moments) -> HashTables:
+        return HashTables(features=jnp.asarray(solve_moments(moments, faces), jnp.float32), layout=layout)
+
+    moments = no_moments(len(faces), 2)
+    for batch in batches(DEPTHS_SHARE, "depths"):
+        moments = add[add_depths](moments, impostor, cage, layout, batch, config=render)
+    depths = tables(moments)
+    moments = no_moments(len(faces), 1 + num_features)
+    for batch in batches(1.0, "contents"):
+        moments = add[add_contents](moments, impostor, cage, depths, batch, config=render)
+    baked = BakedImpostor(
+        mesh=mesh,
+        depths=depths,
+        textures=tables(moments),
+        decoders=impostor.decoders,
+        decoder_index=impostor.decoder_index[cage.parents],
+        config=impostor.config,
+    )
+    return refine(baked, pool, train, render, config, log=log)
+
+
+def fine_cage(scene: Scene, config: BakeConfig) -> tuple[FineCage, Float[np.ndarray, "U 4"]]:
+    """The scene's cage, its tets halved until they are small, and its faces' longest edges in pixels."""
+    coarse = scene.impostor.mesh
+    vertices, tets = world_vertices(coarse), np.asarray(coarse.tets)
+    longest = np.median(face_pixels(vertices, tets, scene.train))
+    fine = subdivide(vertices, tets, max(0, math.ceil(math.log2(longest / config.tet_pixels))))
+    cage = FineCage(
+        mesh=build_tet_mesh(fine.vertices, fine.tets),
+        parents=jnp.asarray(fine.parents, jnp.int32),
+        lambdas=jnp.asarray(fine.lambdas, jnp.float32),
+    )
+    return cage, face_pixels(fine.vertices, fine.tets, scene.train)
+
+
+def fit_config(mesh: TetMesh, pool: PixelPool, probe: RayBatch, config: RenderConfig) -> RenderConfig:
+    """With steps for small tets, and buffers for them."""
+    march = dataclasses.replace(config.march, max_entries_per_ray=pool.entries.holds.shape[1])
+    config = dataclasses.replace(config, march=march, frame_refinement=FIT_REFINEMENT)
+    config = dataclasses.replace(refined(config), min_weight=max(config.min_weight, 1e-4) / FIT_REFINEMENT)
+    return fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, config)
+
+
+def checked_texels(
+    resolutions: Int[np.ndarray, "U 4"], numbers: int, config: BakeConfig, log: Log
+) -> Int[np.ndarray, " 4U"]:
+    """Texels of each face. Raises ValueError where all, of so many numbers each, need too much memory."""
     counts = np.where(resolutions > 0, num_texels(resolutions), 0).reshape(-1)
-    megabytes = counts.sum() * num_basis * num_channels * 4 / 1e6
+    megabytes = counts.sum() * numbers * 4 / 1e6
     log(
-        f"{len(fine.tets):,} tets, {shown.sum():,} of them with textures of at most {resolutions.max()} texels "
-        f"along an edge; {counts.sum():,} texels of {num_basis * num_channels} numbers: {megabytes:.0f} MB"
+        f"{len(resolutions):,} tets, {np.sum(resolutions[:, 0] > 0):,} with textures of at most "
+        f"{resolutions.max()} texels along an edge; {counts.sum():,} texels: {megabytes:.0f} MB"
     )
     if megabytes > config.max_megabytes:
         raise ValueError(
             f"the textures need {megabytes:.0f} MB, more than BakeConfig.max_megabytes = "
             f"{config.max_megabytes}; lower BakeConfig.texels_per_pixel or raise the limit"
         )
-    layout = build_face_layout(resolutions)
-    moments = no_moments(NO_TEXELS + int(counts.sum()), num_basis, num_channels)
-    step = jax.jit(add_moments, static_argnames="config", donate_argnums=0)
-    for batch in batches(config.fit_rays, "fit"):
-        moments = step(moments, impostor, cage, layout, batch, config=render)
-    faces = np.concatenate([np.zeros(NO_TEXELS, int), np.repeat(np.arange(counts.size), counts)])
-    baked = BakedImpostor(
-        mesh=mesh,
-        textures=HashTables(features=jnp.asarray(solve_moments(moments, faces), jnp.float32), layout=layout),
-        decoders=impostor.decoders,
-        decoder_index=impostor.decoder_index[cage.parents],
-        config=impostor.config,
-    )
-    return refine(baked, pool, train, render, config, log=log)
+    if not counts.sum():
+        raise ValueError("nothing is seen in any tet; train the impostor before it is baked")
+    return counts
 
 
 def refine(
@@ -126,22 +156,20 @@ def refine(
     if not config.refine_steps:
         return baked
     optimizer = make_optimizer()
-    parameters = {"features": baked.textures.features, "decoders": baked.decoders}
+    rates = RATES if config.refine_decoders else RATES | {"decoders": 0.0}
+    step = partial(refine_step, config=render, optimizer=optimizer, share=rates.__getitem__)
+    compiled = jax.jit(step, donate_argnums=(0, 1))
+    parameters = jax.tree.map(jnp.copy, baked_parameters(baked))  # steps consume them
     state = optimizer.init(parameters)
-    step = jax.jit(partial(refine_step, config=render, optimizer=optimizer), donate_argnums=(0, 1))
-    parameters = jax.tree.map(jnp.copy, parameters)
     key, losses = jax.random.key(train.seed + 3), []
     for i in tqdm(range(config.refine_steps), desc="refine", unit="step", disable=None):
         batch = draw_batch(key, i, pool, train.rays_per_batch, "random")
         rate = config.learning_rate * FINAL_RATE ** (i / config.refine_steps)
-        decoder_rate = DECODER_RATE * rate if config.refine_decoders else 0.0
-        rates = {"features": jnp.float32(rate), "decoders": jnp.float32(decoder_rate)}
-        parameters, state, loss = step(parameters, state, baked, batch, rates)
+        parameters, state, loss = compiled(parameters, state, baked, batch, jnp.float32(rate))
         losses.append(loss)
     first, last = (np.mean([float(x) for x in part]) for part in (losses[:20], losses[-20:]))
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
-    textures = dataclasses.replace(baked.textures, features=parameters["features"])
-    return dataclasses.replace(baked, textures=textures, decoders=parameters["decoders"])
+    return with_baked_parameters(baked, parameters)
 
 
 def face_pixels(

@@ -17,7 +17,7 @@ from nimpostor_jax.io.blender import PosedImages, check_masks, load_scene
 from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.preprocess.cage import Cage, cage_from_images
-from nimpostor_jax.preprocess.proxies import bounding_box, box_cage
+from nimpostor_jax.preprocess.tetrahedralize import box_tets
 from nimpostor_jax.preprocess.topology import build_tet_mesh
 from nimpostor_jax.preprocess.validate import (
     check_coverage,
@@ -165,7 +165,7 @@ def load_cage(
     else:
         vertices, tets = load_tets(cage)
         if config.cage.shape == "box":
-            vertices, tets = box_cage(bounding_box(vertices))
+            vertices, tets = box_tets(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
         check_tets(vertices, tets, str(cage))
         if train.has_alpha.all():
             views = (train.camera_to_world, train.focal, train.principal)

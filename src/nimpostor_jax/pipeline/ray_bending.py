@@ -18,7 +18,6 @@ from scipy.spatial import cKDTree
 
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.geometry.tetrahedron import signed_volumes
-from nimpostor_jax.preprocess.proxies import bounding_box
 from nimpostor_jax.render.camera import image_pixels, pixel_rays
 from nimpostor_jax.types import Camera, NeuralImpostor
 
@@ -104,7 +103,8 @@ class BentField:
         grid = grid if pixels is None else grid[pixels]
         rays = pixel_rays(camera, jnp.asarray(grid))
         origins, directions = (np.asarray(x, np.float64) for x in (rays.origins, rays.directions))
-        near, far = _box_interval(bounding_box(self._moved), origins, directions)
+        box = np.stack([self._moved.min(axis=0), self._moved.max(axis=0)])
+        near, far = _box_interval(box, origins, directions)
         color, opacity = np.zeros((len(grid), 3)), np.zeros(len(grid))
         hits = np.flatnonzero(far > near)
         for start in range(0, len(hits), RAYS):

@@ -15,9 +15,8 @@ from jaxtyping import Float
 from nimpostor_jax.config import CageConfig
 from nimpostor_jax.preprocess import validate
 from nimpostor_jax.preprocess.envelope import envelope_from_grid, voxelize_surface
-from nimpostor_jax.preprocess.proxies import bounding_box, box_cage
 from nimpostor_jax.preprocess.surface import load_surface
-from nimpostor_jax.preprocess.tetrahedralize import Log, tetrahedralize
+from nimpostor_jax.preprocess.tetrahedralize import BOX_TETS, Log, tetrahedralize
 from nimpostor_jax.preprocess.tighten import tighten
 from nimpostor_jax.preprocess.topology import Cage
 from nimpostor_jax.preprocess.visual_hull import OccupancyGrid, visual_hull
@@ -119,18 +118,14 @@ def _build(
     diagonal = float(np.linalg.norm(np.diff(grid.bounds, axis=0)))
     margin = config.margin
     for attempt in range(_ATTEMPTS):
-        required = _required_points(grid, _TIGHT_SHARE * margin * diagonal)
-        if config.shape == "box":
-            vertices, tets = box_cage(bounding_box(required))
-        else:
-            vertices, tets = tetrahedralize(
-                lambda offset, step: envelope_from_grid(grid, offset, step),
-                config.target_tets,
-                diagonal,
-                margin,
-                log,
-            )
-            vertices = tighten(vertices, tets, required)
+        vertices, tets = tetrahedralize(
+            lambda offset, step: envelope_from_grid(grid, offset, step),
+            BOX_TETS if config.shape == "box" else config.target_tets,
+            diagonal,
+            margin,
+            log,
+        )
+        vertices = tighten(vertices, tets, _required_points(grid, _TIGHT_SHARE * margin * diagonal))
         validate.check_tets(vertices, tets, source)
         report = validate.quality_report(vertices, tets)
         missed = coverage((vertices, tets))

@@ -27,6 +27,7 @@ from nimpostor_jax.preprocess.validate import boundary_faces, orient_tets, signe
 
 Log = Callable[[str], None]
 
+BOX_TETS = 6
 MAX_CALLS = 9
 _CLOSE_ENOUGH = 0.08  # the search stops here
 _TOLERATED = 0.2  # a result within this share of the target is what was asked for

@@ -1,20 +1,19 @@
-"""Rendering baked impostors: one texture lookup a crossed tet, one decoded colour a ray (Sec. 3.4, Eq. 10).
+"""Rendering baked impostors: two texture lookups a crossed tet, one decoded colour a ray (Sec. 3.4, Eq. 10).
 
-A texel has 2 + C channels: opacity, opacity times the share of the segment at which it is seen, and opacity
-times features. They add up linearly in front of each other, and least squares fits them: hence opacity in the
-place of optical depth, which has no bound where something is solid.
+The first lookup, where the ray enters the tet, says how deep in the tet something is seen. That point, moved
+to the face from the corner opposite, is where the second looks up what is seen: its opacity, and its features
+times opacity. Without the first, what lies behind the face would be smeared over the directions from which it
+is seen. Opacity, not optical depth: least squares fits it, and it has a bound where things are solid.
 
-Axes: R rays, N packed segments, K basis functions, C features.
+Axes: R rays, N packed segments, C features.
 """
-
-from functools import partial
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.chunks import map_used
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.encoding.face_grid import ONE_LEVEL
+from nimpostor_jax.encoding.face_grid import ONE_LEVEL, face_of
 from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.field.decoder import num_decoder_sets
@@ -23,10 +22,11 @@ from nimpostor_jax.render.composite import sum_by_ray, transmittance
 from nimpostor_jax.render.renderer import decode_integrated
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables, traverse
-from nimpostor_jax.types import BakedImpostor, Rays, RenderOutput, TetSegments
+from nimpostor_jax.types import BakedImpostor, HashTables, Rays, RenderOutput, TetSegments
 
+BASIS = 4  # functions of the direction
+MIN_OPACITY = 1e-3  # with less, textures of depths do not say where it is
 MAX_OPACITY = 1 - 2.0**-12  # of one tet: what remains of the light is invisible, and its logarithm finite
-HEAD = 2  # channels before the features
 
 
 def render_baked_rays(
@@ -78,19 +78,44 @@ def tet_channels(
 ) -> Float[Array, "N C+2"]:
     """What each ray gathers in each tet: features, 1 and t, times the tet's opacity."""
     tet_ids = jnp.maximum(segments.tet_ids, 0)
-    texels = encode(baked.textures, ONE_LEVEL, tet_ids, segments.lambda_enter, num_used)
+    share = seen_at(baked.depths, segments, num_used)
+    items = (segments.lambda_enter, segments.lambda_exit, share)
+    places = map_used(seen_on_face, (), items, num_used)
+    texels = encode(baked.textures, ONE_LEVEL, tet_ids, places, num_used)
     shown = (segments.tet_ids >= 0) & has_textures(baked)[tet_ids]
-    items = (texels, shown, segments.lambda_exit, segments.t_enter, segments.t_exit)
-    return map_used(partial(_channels, HEAD + baked.config.encoding.feature_dim), (), items, num_used)
+    t = segments.t_enter + share * (segments.t_exit - segments.t_enter)
+    return map_used(_channels, (), (texels, shown, segments.lambda_exit, t), num_used)
 
 
-def _channels(num_channels: int, _: tuple, part: tuple) -> Float[Array, "chunk C+2"]:
-    texels, shown, lambda_exit, t_enter, t_exit = part
-    values = in_basis(texels.reshape(texels.shape[0], -1, num_channels), lambda_exit)
+def seen_at(depths: HashTables, segments: TetSegments, num_used: Int[Array, ""]) -> Float[Array, " N"]:
+    """The share of each segment, in [0, 1], at which something is seen, by the textures of depths."""
+    tet_ids = jnp.maximum(segments.tet_ids, 0)
+    texels = encode(depths, ONE_LEVEL, tet_ids, segments.lambda_enter, num_used)
+    return map_used(_share, (), (texels, segments.lambda_exit), num_used)
+
+
+def _share(_: tuple, part: tuple) -> Float[Array, " chunk"]:
+    texels, lambda_exit = part
+    opacity, place = in_basis(texels, lambda_exit).T
+    known = opacity > MIN_OPACITY
+    return jnp.where(known, jnp.clip(place / jnp.where(known, opacity, 1), 0, 1), 0.5)
+
+
+def seen_on_face(_: tuple, part: tuple) -> Float[Array, "chunk 4"]:
+    """The point at a share of a segment, moved to the face of entry from the corner opposite."""
+    lambda_enter, lambda_exit, share = part
+    point = lambda_enter + share[:, None] * (lambda_exit - lambda_enter)
+    opposite = jnp.arange(4) == face_of(lambda_enter)[:, None]
+    on_face = jnp.where(opposite, 0, point)
+    return on_face / jnp.maximum(jnp.sum(on_face, axis=1, keepdims=True), 1e-3)
+
+
+def _channels(_: tuple, part: tuple) -> Float[Array, "chunk C+2"]:
+    texels, shown, lambda_exit, t = part
+    values = in_basis(texels, lambda_exit)
     opacity = jnp.where(shown, jnp.clip(values[:, 0], 0, MAX_OPACITY), 0)
-    place = jnp.clip(values[:, 1], 0, opacity) * (t_exit - t_enter) + opacity * t_enter
-    features = jnp.where((opacity > 0)[:, None], values[:, HEAD:], 0)
-    return jnp.column_stack([features, opacity, place])
+    features = jnp.where((opacity > 0)[:, None], values[:, 1:], 0)
+    return jnp.column_stack([features, opacity, opacity * t])
 
 
 def has_textures(baked: BakedImpostor) -> Bool[Array, " T"]:
@@ -99,11 +124,10 @@ def has_textures(baked: BakedImpostor) -> Bool[Array, " T"]:
 
 
 def in_basis(
-    coefficients: Float[Array, "M K C"], lambda_exit: Float[Array, "M 4"]
-) -> Float[Array, "M C"]:
-    """Sums of the K functions of the direction: 1, or the coordinates at which a ray leaves the tet."""
-    if coefficients.shape[1] == 1:
-        return coefficients[:, 0]
+    texels: Float[Array, "M 4*channels"], lambda_exit: Float[Array, "M 4"]
+) -> Float[Array, "M channels"]:
+    """Texels in a direction: linear in the coordinates at which the ray leaves the tet."""
+    coefficients = texels.reshape(texels.shape[0], BASIS, -1)
     return jnp.sum(lambda_exit[:, :, None] * coefficients, axis=1)
 
 

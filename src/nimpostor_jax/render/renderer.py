@@ -107,7 +107,7 @@ def integrate_samples(
     directions = field.encode_directions(impostor, rays.directions)
     decoders, num_rays = _only_decoders(impostor), rays.origins.shape[0]
     if config.integrate == "features":
-        sigmas = map_used(_density, decoders, (samples.tet_ids, point_features), num_used)
+        sigmas = sample_densities(impostor, samples.tet_ids, point_features, num_used)
         values = point_features
     else:
         items = (samples.tet_ids, point_features, samples.rays)
@@ -160,6 +160,16 @@ def _only_decoders(impostor: NeuralImpostor) -> NeuralImpostor:
     return dataclasses.replace(impostor, mesh=None, tables=None, occupied=None)  # type: ignore[arg-type]
 
 
+def sample_densities(
+    impostor: NeuralImpostor,
+    tet_ids: Int[Array, " M"],
+    features: Float[Array, "M C"],
+    num_used: Int[Array, ""],
+) -> Float[Array, " M"]:
+    """Densities of the first `num_used` points (Eq. 7)."""
+    return map_used(_density, _only_decoders(impostor), (tet_ids, features), num_used)
+
+
 def _density(decoders: NeuralImpostor, part: tuple) -> Float[Array, " chunk"]:
     return field.density(decoders, *part)
 
@@ -192,7 +202,7 @@ def visible_samples(
     frozen, plan = jax.lax.stop_gradient((impostor, plan))
     samples = place_samples(plan, chosen, num_used)
     features = field.features(frozen, samples.tet_ids, samples.lambdas, num_used)
-    sigmas = map_used(_density, _only_decoders(frozen), (samples.tet_ids, features), num_used)
+    sigmas = sample_densities(frozen, samples.tet_ids, features, num_used)
     least, weights = config.min_weight, _weights(sigmas, samples)
     if refinement is not None:
         weights *= refinement[samples.rays]
