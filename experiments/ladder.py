@@ -52,16 +52,19 @@ class Trained(NamedTuple):
     """A method's impostor on a scene, and its row of the table."""
 
     scene: Scene
-    impostor: NeuralImpostor
+    impostor: NeuralImpostor | BakedImpostor
     row: Row
 
 
 def config_of(
     method: str, resolution: int, configs: Sequence[Path], bindings: Sequence[str]
 ) -> ExperimentConfig:
-    """A method's config at an image width; the caller's files and bindings come last."""
+    """A method's config at an image width, with `CURVE_POINTS`; the caller's files and bindings come last."""
     files = [CONFIGS / f"{METHODS[method]}.gin", *configs]
-    return load_config(files, [f"DataConfig.resolution={resolution}", *bindings])
+    bindings = [f"DataConfig.resolution={resolution}", *bindings]
+    every = max(1, load_config(files, bindings).train.steps // CURVE_POINTS)
+    curve = [f"TrainConfig.eval_every={every}", f"TrainConfig.log_every={every}"]
+    return load_config(files, [*curve, *bindings])
 
 
 def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path, workdir: Path) -> Trained:

@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 from ladder import (
-    CURVE_POINTS,
     QUICK,
     QUICK_RESOLUTION,
     Row,
@@ -66,9 +65,6 @@ def main(argv: Sequence[str]) -> None:
     trained = {}
     for method in ("NGP-Bounded", "BarySpl", "FeatInt"):
         config = config_of(method, resolution, args.gin_configs, bindings)
-        every = max(1, config.train.steps // CURVE_POINTS)
-        curve = [f"TrainConfig.eval_every={every}", f"TrainConfig.log_every={every}"]
-        config = config_of(method, resolution, args.gin_configs, [*bindings, *curve])
         trained[method] = train_or_reuse(method, config, args.scene, cage, folder / f"{resolution}" / method)
     baked, _ = bake_or_reuse(trained["FeatInt"], folder / f"{resolution}" / "Baked")
 

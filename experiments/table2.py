@@ -15,12 +15,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ladder import (
-    CURVE_POINTS,
     METHODS,
     QUICK,
     QUICK_RESOLUTION,
     Row,
     Trained,
+    bake_or_reuse,
     config_of,
     seconds_to,
     train_or_reuse,
@@ -61,6 +61,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of tables, pictures and trained runs")
     parser.add_argument("--resolution", type=int, nargs="+", default=[200], help="image widths")
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--no_bake", action="store_true", help="leave the baked impostor out")
     parser.add_argument("--cage", type=Path, nargs="*", default=[], help="of each scene; default: built")
     parser.add_argument("--quick", action="store_true", help="small and short, to try the script")
     add_flags(parser)
@@ -77,15 +78,12 @@ def main(argv: Sequence[str]) -> None:
             trained = []
             for method in args.methods:
                 config = config_of(method, resolution, args.gin_configs, bindings)
-                steps = max(1, config.train.steps // CURVE_POINTS)
-                config = config_of(
-                    method,
-                    resolution,
-                    args.gin_configs,
-                    [*bindings, f"TrainConfig.eval_every={steps}", f"TrainConfig.log_every={steps}"],
-                )
                 workdir = folder / f"{resolution}" / method
                 trained.append(train_or_reuse(method, config, scene, cage, workdir))
+            if "FeatInt" in args.methods and not args.no_bake:
+                source = trained[args.methods.index("FeatInt")]
+                baked, row = bake_or_reuse(source, folder / f"{resolution}" / "Baked")
+                trained.append(source._replace(impostor=baked, row=row))
             rows += compared(trained)
             write_picture(folder / f"{resolution}.png", trained)
             write_table(args.out / "table2", rows, COLUMNS, notes(rows))

@@ -20,9 +20,9 @@ SMALL = [
 ]
 
 
-def run(script, *arguments):
+def run(script, *arguments, timeout=300):
     command = [sys.executable, str(ROOT / "experiments" / script), *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
 
 
 def test_train_evaluate_and_render(tmp_path):
@@ -64,6 +64,8 @@ def test_train_evaluate_and_render(tmp_path):
         ("train.py", ["--data=fluffy_ball", "--workdir=W", "--max_minutes=-1"], "max_minutes"),
         ("train.py", ["--data=fluffy_ball", "--workdir=W", "--cage=none.npz"], "none.npz"),
         ("evaluate.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
+        ("bake.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
+        ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage=a.npz", "b.npz"], "2 cages for 1 scenes"),
         ("make_cage.py", ["--surface=none.obj", "--out=W/c.npz"], "none.obj"),
     ],
 )
@@ -77,9 +79,41 @@ def test_bad_input_ends_in_one_line(script, arguments, message, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "script", ["train.py", "evaluate.py", "render.py", "make_cage.py", "benchmark.py", "demo.py"]
+    "script",
+    [f"{n}.py" for n in ("train", "evaluate", "render", "make_cage", "benchmark", "demo", "bake", "table2")],
 )
 def test_help_says_what_there_is(script):
     done = run(script, "--help")
     assert done.returncode == 0
     assert "--gin_bindings" in done.stdout and "TrainConfig.steps" in done.stdout
+
+
+SHELL = ROOT.parent / "shared" / "data" / "cages" / "fluffy_ball_shell600.npz"
+
+
+@pytest.mark.slow
+def test_the_tables_come_out_of_scripts(tmp_path):
+    """Every method trained, baked, bent, timed, in small; the second script takes the first one's runs."""
+    cage = [f"--cage={SHELL}"] if SHELL.exists() else []
+    done = run("table2.py", "--scene=fluffy_ball", f"--out={tmp_path}", "--quick", *cage, timeout=1500)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "table2.json").read_text())["rows"]
+    assert [row["method"] for row in rows] == ["NGP-Bounded", "BaryEnc", "BarySpl", "FeatInt", "Baked"]
+    for row in rows:
+        assert row["psnr"] > 5 and row["fps"] > 0 and row["steps"] == 20 and row["resolution"] == 24
+    assert rows[-1]["raster_difference"] < 1e-3
+    for name in ("table2.csv", "table2.md", "fluffy_ball/24.png"):
+        assert (tmp_path / name).exists()
+
+    done = run("table1.py", "--scene=fluffy_ball", f"--out={tmp_path}", "--quick", *cage, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("trained already") == 3 and "baked already" in done.stdout
+    rows = json.loads((tmp_path / "table1.json").read_text())["rows"]
+    assert len(rows) == 5 and all(row["fps"] > 0 for row in rows)
+
+    proxies = ["--quick", "--proxies", "box", "sphere1"]
+    done = run("figure10.py", "--scene=fluffy_ball", f"--out={tmp_path}", *proxies, timeout=900)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "figure10.json").read_text())["rows"]
+    assert rows[0]["tets"] == 6
+    assert rows[1]["tets"] == pytest.approx(436, rel=0.2)

@@ -8,6 +8,7 @@ from typing import Any
 
 _MODULES = {
     "config": (
+        "BakeConfig",
         "CageConfig",
         "DataConfig",
         "DecoderConfig",
@@ -19,19 +20,22 @@ _MODULES = {
         "SamplerConfig",
         "TrainConfig",
     ),
-    "types": ("Camera", "NeuralImpostor", "Rays", "RenderOutput", "TetMesh"),
+    "types": ("BakedImpostor", "Camera", "NeuralImpostor", "Rays", "RenderOutput", "TetMesh"),
     "edit.deform": ("bend", "deform", "deformation_report", "rigid", "stretch", "twist"),
     "field.impostor": ("init_impostor",),
     "geometry.locate": ("locate",),
     "gin_flags": ("load_config",),
-    "io.impostor_file": ("load_impostor", "save_impostor"),
+    "io.impostor_file": ("load_baked", "load_impostor", "save_impostor"),
+    "pipeline.bake": ("bake",),
     "pipeline.evaluate": ("camera_of", "evaluate", "orbit"),
     "pipeline.fit": ("fit",),
     "pipeline.prepare": ("Scene", "prepare", "use_all_cores"),
+    "pipeline.ray_bending": ("BentField",),
     "preprocess.cage": ("cage_from_images", "cage_from_surface"),
     "preprocess.topology": ("build_tet_mesh", "world_vertices"),
     "render.camera": ("image_pixels", "pixel_rays"),
     "render.frame": ("frame_config", "render_frame", "to_image"),
+    "render.raster_frame": ("rasterize_frame",),
     "render.renderer": ("render_rays",),
     "train.step": ("train_step",),
 }

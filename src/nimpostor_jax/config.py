@@ -309,7 +309,7 @@ class BakeConfig:
     training improve the textures (and with `refine_decoders` the decoders) on whole pictures.
     """
 
-    tet_pixels: float = 6.0
+    tet_pixels: float = 20.0
     texels_per_pixel: float = 0.7  # along an edge, at the training views' distance
     max_resolution: int = 256  # texels along an edge
     min_opacity: float = 2e-3  # of a tet, on average over the light that reaches it; less is left out

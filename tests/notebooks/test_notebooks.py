@@ -10,11 +10,17 @@ from nbclient import NotebookClient
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.ipynb"))
 
 
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+# What takes several minutes is run by `make test-slow`.
+SLOW = {"02_ablation"}
+CASES = [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in SLOW), id=p.stem) for p in NOTEBOOKS]
+
+
+@pytest.mark.parametrize("path", CASES)
 def test_runs(path, monkeypatch):
     monkeypatch.setitem(os.environ, "MPLBACKEND", "agg")
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(notebook, timeout=240, kernel_name="python3").execute()
+    folder = {"metadata": {"path": str(path.parent)}}
+    NotebookClient(notebook, timeout=600, kernel_name="python3", resources=folder).execute()
     outputs = [str(output) for cell in notebook.cells if cell.cell_type == "code" for output in cell.outputs]
     assert any("PSNR" in output for output in outputs)
 
