@@ -26,7 +26,7 @@ from nimpostor_jax.train.losses import photometric
 from nimpostor_jax.train.step import Parameters, RayBatch
 from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, NeuralImpostor, TetMesh, TetSegments
 
-RIDGE = 0.03  # of a texel's evidence, against dependence on the direction
+RIDGE = 1e-3  # of a texel's evidence, against dependence on the direction
 FACE_EVIDENCE = 0.05  # rays that a face's mean counts for in each of its texels
 
 

@@ -1,0 +1,77 @@
+"""train.bake: what rays gather in single tets, and the least squares of textures."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from meshes import MESHES, local_vertices
+from numpy.testing import assert_allclose
+from rays import as_rays, generic
+from scenes import RENDER, exact
+
+from nimpostor_jax.preprocess.subdivide import subdivide
+from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.train.bake import FineCage, Moments, gather_by_tet, solve_moments
+from nimpostor_jax.train.step import RayBatch
+
+COUNT = 32
+
+
+@pytest.mark.parametrize("times", [0, 1])
+def test_what_tets_gather_adds_up_to_the_picture(times, x64):
+    """On a cage as coarse as the field's, or finer: samples stay where they are, only sums are cut."""
+    impostor = scenes.impostor("blobs", "float64")
+    fine = subdivide(*MESHES["blobs"](), times)
+    cage = FineCage(
+        mesh=build_tet_mesh(fine.vertices, fine.tets, dtype="float64"),
+        parents=jnp.asarray(fine.parents, jnp.int32),
+        lambdas=jnp.asarray(fine.lambdas),
+    )
+    march = dataclasses.replace(RENDER.march, max_tets_per_ray=64, max_entries_per_ray=4)
+    config = dataclasses.replace(exact(max_samples_per_ray=64, min_weight=1e-12), march=march)
+    origins, directions = generic(*local_vertices(impostor.mesh), np.random.default_rng(3), COUNT)
+    center, scale = np.asarray(impostor.mesh.center), float(impostor.mesh.scale)
+    rays = as_rays((center + scale * origins, directions), "float64")
+    jitter = jnp.linspace(0, 0.99, COUNT)
+    batch = RayBatch(rays=rays, target=jnp.zeros((COUNT, 4)), background=jnp.zeros((COUNT, 3)), jitter=jitter)
+    found = jax.jit(gather_by_tet, static_argnames="config")(impostor, cage, batch, config=config)
+    output = jax.jit(render_rays, static_argnames="config")(impostor, rays, config, jitter)
+    segments = found.segments
+    lengths = segments.t_exit - segments.t_enter
+    seen = found.light * found.opacity
+    places = found.light * (found.opacity * segments.t_enter + found.place * lengths)
+    opacity, depth = (np.bincount(segments.rays, x, COUNT) for x in (seen, places))
+    # sums of some dozens of terms, some of them from another side of a face
+    assert_allclose(opacity, output.opacity, atol=1e-9)
+    assert_allclose(depth * scale, output.depth * output.opacity, atol=1e-8)
+    assert np.std(opacity) > 0.05
+    assert np.sum(np.asarray(segments.tet_ids) >= 0) > COUNT * (2 if times else 1)
+
+
+def test_least_squares_finds_what_depends_on_the_direction(rng):
+    """Plenty of rays: the ridge holds back 2 % of the dependence (variance 1/20), the mean not at all."""
+    truth = rng.normal(size=(5, 4, 2))
+    basis = rng.dirichlet(np.ones(4), (5, 4000))
+    values = np.einsum("nsk,nkc->nsc", basis, truth)
+    moments = Moments(
+        products=jnp.asarray(np.einsum("nsk,nsl->nkl", basis, basis)),
+        sums=jnp.asarray(np.einsum("nsk,nsc->nkc", basis, values)),
+    )
+    found = solve_moments(moments, np.arange(5)).reshape(5, 4, 2)
+    errors = np.einsum("nsk,nkc->nsc", basis, found - truth)
+    assert np.sqrt(np.mean(errors**2)) < 0.04 * np.std(values)
+    assert_allclose(errors.mean(axis=1), 0, atol=1e-3)
+
+
+def test_texels_that_no_ray_has_seen_take_after_their_face():
+    sums = np.zeros((3, 4, 1))
+    products = np.zeros((3, 4, 4))
+    sums[0], products[0] = 25 * 0.25 * 0.8, 25 * 0.0625  # 25 rays, all through the middle: 0.8
+    moments = Moments(products=jnp.asarray(products), sums=jnp.asarray(sums))
+    found = solve_moments(moments, np.array([0, 0, 1]))
+    assert_allclose(found[1], 0.8, atol=1e-3)  # the same face
+    assert_allclose(found[2], 0, atol=1e-6)  # another face, unseen
