@@ -11,7 +11,7 @@ Axes: R rays, N packed segments, C features.
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import map_used
+from nimpostor_jax.chunks import map_used, packed_indices
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.encoding.face_grid import ONE_LEVEL, face_of
 from nimpostor_jax.encoding.hash_grid import encode
@@ -54,11 +54,11 @@ def render_baked_rays(
 
 def shade_segments(baked: BakedImpostor, rays: Rays, segments: TetSegments) -> RenderOutput:
     """Look up, composite and decode the tets that rays [R], in the mesh's own frame, cross in order."""
-    num_used = _used_slots(segments)
+    segments, num_used = textured_segments(baked, segments)
     channels = tet_channels(baked, segments, num_used)
     light = transmittance(-jnp.log1p(-channels[:, -2]), segments.rays, num_used)
     num_rays, num_sets = rays.origins.shape[0], num_decoder_sets(baked.decoders)
-    rows = segments.rays * num_sets + baked.decoder_index[jnp.maximum(segments.tet_ids, 0)]
+    rows = segments.rays * num_sets + baked.decoder_index[segments.tet_ids]
     sums = sum_by_ray(light, channels, rows, num_rays * num_sets, num_used)
     directions = spherical_harmonics(rays.directions, baked.config.decoder.sh_degree)
     sums = decode_integrated(baked.decoders, sums, directions)
@@ -73,18 +73,31 @@ def shade_segments(baked: BakedImpostor, rays: Rays, segments: TetSegments) -> R
     )
 
 
+def textured_segments(
+    baked: BakedImpostor, segments: TetSegments
+) -> tuple[TetSegments, Int[Array, ""]]:
+    """Those of the segments that lie in tets with textures, at the front, and how many."""
+    tet_ids = jnp.maximum(segments.tet_ids, 0)
+    keep = (segments.tet_ids >= 0) & has_textures(baked)[tet_ids]
+    chosen, count = packed_indices(keep)
+    names = ("t_enter", "t_exit", "lambda_enter", "lambda_exit")
+    columns = {name: getattr(segments, name) for name in names} | {"tet_ids": tet_ids}
+    packed = {name: column[chosen] for name, column in columns.items()}
+    # Ascending in what no slot holds, too: sums along rays ask for that.
+    rays = jnp.where(jnp.arange(chosen.size) < count, segments.rays[chosen], segments.overflow.shape[0] - 1)
+    return segments.replace(rays=rays, **packed), count  # type: ignore[attr-defined]
+
+
 def tet_channels(
     baked: BakedImpostor, segments: TetSegments, num_used: Int[Array, ""]
 ) -> Float[Array, "N C+2"]:
     """What each ray gathers in each tet: features, 1 and t, times the tet's opacity."""
-    tet_ids = jnp.maximum(segments.tet_ids, 0)
     share = seen_at(baked.depths, segments, num_used)
     items = (segments.lambda_enter, segments.lambda_exit, share)
     places = map_used(seen_on_face, (), items, num_used)
-    texels = encode(baked.textures, ONE_LEVEL, tet_ids, places, num_used)
-    shown = (segments.tet_ids >= 0) & has_textures(baked)[tet_ids]
+    texels = encode(baked.textures, ONE_LEVEL, segments.tet_ids, places, num_used)
     t = segments.t_enter + share * (segments.t_exit - segments.t_enter)
-    return map_used(_channels, (), (texels, shown, segments.lambda_exit, t), num_used)
+    return map_used(_channels, (), (texels, segments.lambda_exit, t), num_used)
 
 
 def seen_at(depths: HashTables, segments: TetSegments, num_used: Int[Array, ""]) -> Float[Array, " N"]:
@@ -111,9 +124,9 @@ def seen_on_face(_: tuple, part: tuple) -> Float[Array, "chunk 4"]:
 
 
 def _channels(_: tuple, part: tuple) -> Float[Array, "chunk C+2"]:
-    texels, shown, lambda_exit, t = part
+    texels, lambda_exit, t = part
     values = in_basis(texels, lambda_exit)
-    opacity = jnp.where(shown, jnp.clip(values[:, 0], 0, MAX_OPACITY), 0)
+    opacity = jnp.clip(values[:, 0], 0, MAX_OPACITY)
     features = jnp.where((opacity > 0)[:, None], values[:, 1:], 0)
     return jnp.column_stack([features, opacity, opacity * t])
 
@@ -129,9 +142,3 @@ def in_basis(
     """Texels in a direction: linear in the coordinates at which the ray leaves the tet."""
     coefficients = texels.reshape(texels.shape[0], BASIS, -1)
     return jnp.sum(lambda_exit[:, :, None] * coefficients, axis=1)
-
-
-def _used_slots(segments: TetSegments) -> Int[Array, ""]:
-    """How many slots hold all segments."""
-    order = jnp.arange(segments.rays.size, dtype=jnp.int32)
-    return jnp.max(jnp.where(segments.tet_ids >= 0, order + 1, 0), initial=0)
