@@ -41,7 +41,7 @@ from nimpostor_jax.types import Camera
 
 PAPER = {"ray bending (KNN)": 0.147, "volume": 39.42, "baked, rasterized": 157.83}  # fps, mic, 294 tets
 COLUMNS = ("method", "scene", "size", "ms", "fps", "times_ray_bending", "psnr", "paper_fps")
-REPEATS = 5
+REPEATS = 3
 WAYS = ("marched", "rasterized")
 
 
@@ -52,7 +52,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of table, pictures and trained runs")
     parser.add_argument("--resolution", type=int, default=200, help="image width for training")
     parser.add_argument("--size", type=int, default=800, help="image width for timing")
-    parser.add_argument("--every", type=int, default=8, help="of how many tiles ray bending renders one")
+    parser.add_argument("--every", type=int, default=32, help="of how many tiles ray bending renders one")
     parser.add_argument("--cage", type=Path, help="default: built")
     parser.add_argument("--quick", action="store_true", help="small and short, to try the script")
     add_flags(parser)
@@ -94,6 +94,8 @@ def main(argv: Sequence[str]) -> None:
             frame()
             seconds[name].append(time.perf_counter() - start)
 
+    for name, values in seconds.items():
+        print(f"{name}: {1e3 * np.median(values):.0f} ms", flush=True)
     mesh = trained["BarySpl"].impostor.mesh
     vertices = world_vertices(mesh)
     bent = BentField(trained["NGP-Bounded"].impostor, vertices, vertices, np.asarray(mesh.tets))
