@@ -21,12 +21,11 @@ def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), empty=0.2):
         return HashTables(features=jnp.asarray(texels.reshape(count, -1), dtype), layout=layout)
 
     seen = rng.uniform(*opacity, (count, 4, 1))
-    depths = np.concatenate([seen, seen * rng.uniform(size=seen.shape)], axis=2)
     features = rng.normal(size=(count, 4, made.config.encoding.feature_dim))
     return BakedImpostor(
         mesh=made.mesh,
-        depths=tables(depths),
-        textures=tables(np.concatenate([seen, seen * features], axis=2)),
+        depths=tables(rng.uniform(size=seen.shape)),
+        textures=tables(np.concatenate([seen, features], axis=2)),
         decoders=made.decoders,
         decoder_index=made.decoder_index,
         config=made.config,

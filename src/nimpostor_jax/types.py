@@ -138,8 +138,8 @@ class BakedImpostor:
     """
 
     mesh: TetMesh
-    depths: HashTables  # features [texels, 4 * 2]: opacity, and opacity times where on the way it is seen
-    textures: HashTables  # features [texels, 4 * (1 + C)]: opacity, and integrated features; same FaceLayout
+    depths: HashTables  # features [texels, 4]: where on the way through the tet something is seen
+    textures: HashTables  # features [texels, 4 * (1 + C)]: opacity and mean features; same FaceLayout
     decoders: dict[str, Any]
     decoder_index: Int[Array, " T"]
     config: ImpostorConfig = struct.field(pytree_node=False)

@@ -57,12 +57,11 @@ def tet_lookup(baked, tet, enter, leave):
     """What one ray sees in one tet: opacity, share of the way, features times opacity."""
     if int(baked.textures.layout.resolutions[tet, 0]) == 0:
         return 0.0, 0.5, np.zeros(baked.config.encoding.feature_dim)
-    opacity, place = texel_lookup(baked.depths, tet, enter, leave)
-    share = place / opacity
+    (share,) = texel_lookup(baked.depths, tet, enter, leave)
     point = enter + share * (leave - enter)
     point[int(np.argmin(enter))] = 0
     opacity, *features = texel_lookup(baked.textures, tet, point / point.sum(), leave)
-    return opacity, share, np.array(features)
+    return opacity, share, opacity * np.array(features)
 
 
 def mlp(layers, x):

@@ -76,24 +76,25 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     resolutions = np.clip(np.ceil(config.texels_per_pixel * pixels), 1, config.max_resolution)
     resolutions = np.where(shown[:, None], resolutions, 0).astype(np.int64)
     num_features = impostor.config.encoding.feature_dim
-    counts = checked_texels(resolutions, BASIS * (3 + num_features), config, log)
+    counts = checked_texels(resolutions, BASIS * (2 + num_features), config, log)
     faces = np.concatenate([np.zeros(NO_TEXELS, int), np.repeat(np.arange(counts.size), counts)])
     layout = build_face_layout(resolutions)
 
-    def tables(moments: Moments) -> HashTables:
-        return HashTables(features=jnp.asarray(solve_moments(moments, faces), jnp.float32), layout=layout)
+    def tables(*moments: Moments) -> HashTables:
+        texels = np.concatenate([solve_moments(part, faces) for part in moments], axis=2)
+        return HashTables(features=jnp.asarray(texels.reshape(len(faces), -1), jnp.float32), layout=layout)
 
-    moments = no_moments(len(faces), 2)
+    moments = no_moments(len(faces), 1)
     for batch in batches(DEPTHS_SHARE, "depths"):
         moments = add[add_depths](moments, impostor, cage, layout, batch, config=render)
     depths = tables(moments)
-    moments = no_moments(len(faces), 1 + num_features)
+    contents = no_moments(len(faces), 1), no_moments(len(faces), num_features)
     for batch in batches(1.0, "contents"):
-        moments = add[add_contents](moments, impostor, cage, depths, batch, config=render)
+        contents = add[add_contents](contents, impostor, cage, depths, batch, config=render)
     baked = BakedImpostor(
         mesh=mesh,
         depths=depths,
-        textures=tables(moments),
+        textures=tables(*contents),
         decoders=impostor.decoders,
         decoder_index=impostor.decoder_index[cage.parents],
         config=impostor.config,

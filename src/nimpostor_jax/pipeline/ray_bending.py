@@ -23,6 +23,7 @@ from nimpostor_jax.types import Camera, NeuralImpostor
 
 NEAREST = 8  # cage vertices around which a sample is sought
 RAYS = 4096  # at a time
+LOCATED = 1 << 15  # points at a time: what is computed for them stays in the cache
 POINTS = 1 << 16  # a call of the field
 INSIDE = -1e-6  # barycentric coordinates of points on a face, rounded
 
@@ -51,6 +52,8 @@ class BentField:
         corners = self._moved[self._tets]
         self._first = corners[:, 0]
         self._to_lambda = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+        self._centers = corners.mean(axis=1)
+        self._radii = np.linalg.norm(corners - self._centers[:, None], axis=2).max(axis=1) * (1 + 1e-9)
 
     def locate(
         self, points: Float[np.ndarray, "M 3"]
@@ -58,21 +61,32 @@ class BentField:
         """The tet around each point of the deformed cage, -1 where none is found, and its coordinates."""
         found = np.full(len(points), -1)
         lambdas = np.zeros((len(points), 4))
+        for start in range(0, len(points), LOCATED):
+            part = slice(start, start + LOCATED)
+            self._locate(points[part], found[part], lambdas[part])
+        return found, lambdas
+
+    def _locate(
+        self,
+        points: Float[np.ndarray, "M 3"],
+        found: Int[np.ndarray, " M"],
+        lambdas: Float[np.ndarray, "M 4"],
+    ) -> None:
+        """Writes what it finds."""
         _, nearest = self._tree.query(points, k=min(NEAREST, len(self._moved)), workers=-1)
         nearest = nearest.reshape(len(points), -1)
-        open_points = np.arange(len(points))
         for turn in range(nearest.shape[1]):  # most are found around the first
-            candidates = self._around[nearest[open_points, turn]]
-            offset = points[open_points, None] - self._first[candidates]
-            rest = np.einsum("mcij,mcj->mci", self._to_lambda[candidates], offset)
-            all_four = np.concatenate([1 - rest.sum(axis=-1, keepdims=True), rest], axis=-1)
-            inside = (all_four.min(axis=-1) >= INSIDE) & (candidates >= 0)
-            hit = np.flatnonzero(inside.any(axis=1))
-            which = inside[hit].argmax(axis=1)
-            found[open_points[hit]] = candidates[hit, which]
-            lambdas[open_points[hit]] = all_four[hit, which]
-            open_points = np.delete(open_points, hit)
-        return found, lambdas
+            still = np.flatnonzero(found < 0)
+            candidates = self._around[nearest[still, turn]]
+            # Bounding spheres first: few of the tets around a vertex come near the point.
+            apart = np.sum((points[still, None] - self._centers[candidates]) ** 2, axis=-1)
+            row, column = np.nonzero((apart <= self._radii[candidates] ** 2) & (candidates >= 0))
+            tets, which = candidates[row, column], still[row]
+            rest = np.einsum("mij,mj->mi", self._to_lambda[tets], points[which] - self._first[tets])
+            all_four = np.concatenate([1 - rest.sum(axis=1, keepdims=True), rest], axis=1)
+            inside = np.flatnonzero(all_four.min(axis=1) >= INSIDE)
+            found[which[inside]] = tets[inside]
+            lambdas[which[inside]] = all_four[inside]
 
     def evaluate(
         self, points: Float[np.ndarray, "M 3"], directions: Float[np.ndarray, "M 3"]

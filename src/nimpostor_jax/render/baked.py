@@ -1,9 +1,9 @@
 """Rendering baked impostors: two texture lookups a crossed tet, one decoded colour a ray (Sec. 3.4, Eq. 10).
 
 The first lookup, where the ray enters the tet, says how deep in the tet something is seen. That point, moved
-to the face from the corner opposite, is where the second looks up what is seen: its opacity, and its features
-times opacity. Without the first, what lies behind the face would be smeared over the directions from which it
-is seen. Opacity, not optical depth: least squares fits it, and it has a bound where things are solid.
+to the face from the corner opposite, is where the second looks up what is seen: opacity and mean features.
+Without the first, what lies behind the face would be smeared over the directions from which it is seen.
+Opacity, not optical depth: least squares fits it, and it has a bound where things are solid.
 
 Axes: R rays, N packed segments, C features.
 """
@@ -25,7 +25,6 @@ from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables, tr
 from nimpostor_jax.types import BakedImpostor, HashTables, Rays, RenderOutput, TetSegments
 
 BASIS = 4  # functions of the direction
-MIN_OPACITY = 1e-3  # with less, textures of depths do not say where it is
 MAX_OPACITY = 1 - 2.0**-12  # of one tet: what remains of the light is invisible, and its logarithm finite
 
 
@@ -108,10 +107,7 @@ def seen_at(depths: HashTables, segments: TetSegments, num_used: Int[Array, ""])
 
 
 def _share(_: tuple, part: tuple) -> Float[Array, " chunk"]:
-    texels, lambda_exit = part
-    opacity, place = in_basis(texels, lambda_exit).T
-    known = opacity > MIN_OPACITY
-    return jnp.where(known, jnp.clip(place / jnp.where(known, opacity, 1), 0, 1), 0.5)
+    return jnp.clip(in_basis(*part)[:, 0], 0, 1)
 
 
 def seen_on_face(_: tuple, part: tuple) -> Float[Array, "chunk 4"]:
@@ -127,8 +123,7 @@ def _channels(_: tuple, part: tuple) -> Float[Array, "chunk C+2"]:
     texels, lambda_exit, t = part
     values = in_basis(texels, lambda_exit)
     opacity = jnp.clip(values[:, 0], 0, MAX_OPACITY)
-    features = jnp.where((opacity > 0)[:, None], values[:, 1:], 0)
-    return jnp.column_stack([features, opacity, opacity * t])
+    return jnp.column_stack([opacity[:, None] * values[:, 1:], opacity, opacity * t])
 
 
 def has_textures(baked: BakedImpostor) -> Bool[Array, " T"]:

@@ -5,6 +5,7 @@ Axes: R rays, N packed segments, M samples, C features, U tets of the cage that 
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -46,8 +47,8 @@ class Gathered:
     segments: TetSegments
     light: Float[Array, " N"]  # that reaches the segment; 0 in empty slots
     opacity: Float[Array, " N"]
-    place: Float[Array, " N"]  # opacity times the share of the segment at which it is seen
-    features: Float[Array, "N C"]  # times opacity
+    share: Float[Array, " N"]  # of the segment at which it is seen, on average
+    features: Float[Array, "N C"]  # their mean
 
 
 def gather_by_tet(
@@ -72,8 +73,10 @@ def gather_by_tet(
     sums = sum_by_ray(sample_weights(depths, owners, count), values, owners, num_segments, count)
     by_tet = jax.ops.segment_sum(depths, owners, num_segments, indices_are_sorted=True)
     light = jnp.where(segments.tet_ids >= 0, transmittance(by_tet, segments.rays), 0)
+    opacity = sums[:, -2]
+    means = sums / jnp.where(opacity > 0, opacity, 1)[:, None]
     return Gathered(
-        segments=segments, light=light, opacity=sums[:, -2], place=sums[:, -1], features=sums[:, :-2]
+        segments=segments, light=light, opacity=opacity, share=means[:, -1], features=means[:, :-2]
     )
 
 
@@ -130,51 +133,57 @@ def add_depths(
 ) -> Moments:
     """Add where on their way through the tets a batch of rays sees something, by the point of entry."""
     gathered = gather_by_tet(impostor, cage, batch, config)
-    channels = jnp.stack([gathered.opacity, gathered.place], axis=1)
-    return _add(moments, layout, gathered, gathered.segments.lambda_enter, channels)
+    segments, mass = gathered.segments, gathered.light * gathered.opacity
+    return _add(moments, layout, segments, segments.lambda_enter, mass, gathered.share[:, None])
 
 
 def add_contents(
-    moments: Moments,
+    moments: tuple[Moments, Moments],
     impostor: NeuralImpostor,
     cage: FineCage,
     depths: HashTables,
     batch: RayBatch,
     config: RenderConfig,
-) -> Moments:
-    """Add what a batch of rays gathers in the tets, by the point where `depths` says that it is seen."""
+) -> tuple[Moments, Moments]:
+    """Add opacity, and features by opacity, by the point where `depths` says that they are seen."""
     gathered = gather_by_tet(impostor, cage, batch, config)
     segments = gathered.segments
     share = seen_at(depths, segments, jnp.int32(segments.rays.size))
     places = seen_on_face((), (segments.lambda_enter, segments.lambda_exit, share))
-    channels = jnp.column_stack([gathered.opacity, gathered.features])
-    return _add(moments, depths.layout, gathered, places, channels)  # type: ignore[arg-type]
+    layout: FaceLayout = depths.layout  # type: ignore[assignment]
+    add = partial(_add, layout=layout, segments=segments, places=places)
+    mass = gathered.light
+    return (
+        add(moments[0], mass=mass, channels=gathered.opacity[:, None]),
+        add(moments[1], mass=mass * gathered.opacity, channels=gathered.features),
+    )
 
 
 def _add(
     moments: Moments,
     layout: FaceLayout,
-    gathered: Gathered,
+    segments: TetSegments,
     places: Float[Array, "N 4"],
+    mass: Float[Array, " N"],
     channels: Float[Array, "N channels"],
 ) -> Moments:
-    tet_ids = jnp.maximum(gathered.segments.tet_ids, 0)
-    light = gathered.light * (layout.resolutions[tet_ids, 0] > 0)
+    tet_ids = jnp.maximum(segments.tet_ids, 0)
+    mass *= layout.resolutions[tet_ids, 0] > 0
     grid, level = FaceGrid(ONE_LEVEL, layout), jnp.int32(0)
     points = grid.prepare(tet_ids, places)
-    basis = gathered.segments.lambda_exit
+    basis = segments.lambda_exit
     products, sums = moments.products, moments.sums
     for weight, node in zip(*grid.corners(level, points.coordinates), strict=True):
         entries = grid.dense_address(level, level, points, node)
-        mass = (weight * light)[:, None] * basis
-        products = products.at[entries].add(mass[:, :, None] * basis[:, None, :])
-        sums = sums.at[entries].add(mass[:, :, None] * channels[:, None, :])
+        weighted = (weight * mass)[:, None] * basis
+        products = products.at[entries].add(weighted[:, :, None] * basis[:, None, :])
+        sums = sums.at[entries].add(weighted[:, :, None] * channels[:, None, :])
     return Moments(products=products, sums=sums)
 
 
 def solve_moments(
     moments: Moments, face_of_texel: Int[np.ndarray, " texels"]
-) -> Float[np.ndarray, "texels 4*channels"]:
+) -> Float[np.ndarray, "texels 4 channels"]:
     """Each texel's coefficients. Host code, float64.
 
     A texel that few rays have seen takes after the mean of its face, and all dependence on the direction is
@@ -190,8 +199,7 @@ def solve_moments(
     mean /= (mass + FACE_EVIDENCE)[:, None]
     rest = sums - products.sum(axis=2)[:, :, None] * mean[:, None, :]
     ridge = (RIDGE * mass + FACE_EVIDENCE)[:, None, None] * np.eye(BASIS)
-    coefficients = mean[:, None, :] + np.linalg.solve(products + ridge, rest)
-    return coefficients.reshape(len(mass), -1)
+    return mean[:, None, :] + np.linalg.solve(products + ridge, rest)
 
 
 def baked_parameters(baked: BakedImpostor) -> Parameters:

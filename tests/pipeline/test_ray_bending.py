@@ -1,0 +1,66 @@
+"""pipeline.ray_bending: samples of a deformed cage, mapped back to its rest pose."""
+
+import jax
+import numpy as np
+import oracles
+import pytest
+from meshes import MESHES
+from numpy.testing import assert_allclose
+
+from nimpostor_jax.config import EncodingConfig, ImpostorConfig
+from nimpostor_jax.field.impostor import init_impostor
+from nimpostor_jax.pipeline.ray_bending import BentField
+from nimpostor_jax.preprocess.tetrahedralize import box_tets
+from nimpostor_jax.preprocess.topology import build_tet_mesh
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """A cage turned and stretched, around a field in its rest pose's bounding box."""
+    vertices, tets = MESHES["delaunay"]()
+    box = box_tets(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+    encoding = EncodingConfig(layout="box", interpolation="grid", num_levels=2, base_resolution=4)
+    field = init_impostor(jax.random.key(0), build_tet_mesh(*box), ImpostorConfig(encoding=encoding))
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.3]])
+    return BentField(field, vertices, vertices @ turn.T, tets), vertices, vertices @ turn.T, tets
+
+
+def test_points_are_found_in_their_tets(bent, rng):
+    field, _, moved, tets = bent
+    ids, lambdas = rng.integers(0, len(tets), 300), rng.dirichlet(np.ones(4), 300)
+    points = np.einsum("mi,mix->mx", lambdas, moved[tets[ids]])
+    found, there = field.locate(points)
+    # A tet may have none of the 8 nearest vertices: such points are lost, as in the method itself.
+    assert np.mean(found == ids) > 0.9
+    hit = found == ids
+    assert_allclose(there[hit], lambdas[hit], atol=1e-9)
+    for point, tet, coordinates in zip(points[hit][:20], found[hit][:20], there[hit][:20], strict=True):
+        assert_allclose(coordinates, oracles.barycentric(point, moved[tets[tet]]), atol=1e-9)
+    outside, _ = field.locate(points + 100)
+    assert np.all(outside == -1)
+
+
+def test_the_field_is_asked_at_rest(bent, rng):
+    """Equal points of the rest pose have equal density and colour, whichever way the cage has moved."""
+    field, vertices, moved, tets = bent
+    still = BentField(field._impostor, vertices, vertices, tets)
+    ids, lambdas = rng.integers(0, len(tets), 50), rng.dirichlet(np.ones(4), 50)
+    directions = np.tile([0.0, 0.0, 1.0], (50, 1))
+    values = []
+    for each, cage in ((field, moved), (still, vertices)):
+        points = np.einsum("mi,mix->mx", lambdas, cage[tets[ids]])
+        sigmas, colors = each.evaluate(points, directions)
+        values.append(np.column_stack([sigmas, colors])[(each.locate(points)[0] == ids)])
+    assert min(map(len, values)) > 40
+    if len(values[0]) == len(values[1]):
+        assert_allclose(values[0], values[1], rtol=1e-4)  # float32 coordinates
+
+
+def test_what_cannot_be_bent_is_refused(bent):
+    field, vertices, _, tets = bent
+    mesh = build_tet_mesh(vertices, tets)
+    other = init_impostor(jax.random.key(0), mesh, ImpostorConfig(encoding=EncodingConfig(num_levels=2)))
+    with pytest.raises(ValueError, match=r"needs a Cartesian field .*layout = 'box'.*per_simplex"):
+        BentField(other, vertices, vertices, tets)
+    with pytest.raises(ValueError, match="not the same cage"):
+        BentField(field._impostor, vertices, vertices[:-1], tets)
