@@ -12,13 +12,13 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 from jaxtyping import Bool, Float
 
-from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.render.baked import render_baked_rays
 from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, all_entries, fit_capacities, grow_march, ray_entries
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables
-from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor, Rays, RenderOutput
+from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor, Rays, RenderOutput, TetMesh
 
 CHUNK = 8192  # rays a call
 MAX_REFINEMENT = 32  # of the steps, to meet a tolerance
@@ -146,12 +146,22 @@ class View:
         self._impostor, self._config = impostor, config
         self._tables = _march_tables(impostor.mesh)
         self._rays = _tiled_rays(camera, camera.height, camera.width)
-        self._entries = ray_entries(impostor.mesh, self._tables, self._rays, config.march)
-        self.hits = np.flatnonzero(np.asarray(self._entries.holds)[:, 0] >= 0)
         mesh = device_mesh()
         self._num_devices = mesh.size
         self._replicas = jax.device_put((impostor, self._tables), NamedSharding(mesh, P()))
         self._by_ray = NamedSharding(mesh, P("rays"))
+        self._entries = self._all_entries()
+        self.hits = np.flatnonzero(self._entries.holds[:, 0] >= 0)
+
+    def _all_entries(self) -> Entries:
+        """Entries of all of the camera's rays, on the host; whole tiles of them go to each device."""
+        count = self._rays.origins.shape[0]
+        padding = (0, -count % (TILE * TILE * self._num_devices))
+        rays = jax.tree.map(lambda x: jnp.pad(x, (padding, (0, 0)), mode="edge"), self._rays)
+        impostor, tables = self._replicas
+        placed = jax.device_put(rays, self._by_ray)
+        entries = _entries_sharded(impostor.mesh, tables, placed, self._config.march)
+        return jax.tree.map(lambda x: np.asarray(x)[:count], entries)
 
     def render(self, pixels: np.ndarray, refinement: int = 1) -> dict[str, np.ndarray]:
         """Outputs [len(pixels), ...] by name, with steps divided by `refinement`."""
@@ -214,6 +224,17 @@ def device_mesh() -> Mesh:
     """All local devices in a row, over which rays are split."""
     devices = jax.local_devices()
     return jax.make_mesh((len(devices),), ("rays",), axis_types=(AxisType.Auto,), devices=devices)
+
+
+@partial(jax.jit, static_argnames="config")
+def _entries_sharded(mesh: TetMesh, tables: MarchTables, rays: Rays, config: MarchConfig) -> Entries:
+    specs = (P(), P(), P("rays"))
+
+    @partial(jax.shard_map, mesh=device_mesh(), in_specs=specs, out_specs=P("rays"), check_vma=False)
+    def shard(mesh: TetMesh, tables: MarchTables, rays: Rays) -> Entries:
+        return ray_entries(mesh, tables, rays, config)
+
+    return shard(mesh, tables, rays)
 
 
 @partial(jax.jit, static_argnames="config")
