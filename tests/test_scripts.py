@@ -65,7 +65,7 @@ def test_train_evaluate_and_render(tmp_path):
         ("train.py", ["--data=fluffy_ball", "--workdir=W", "--cage=none.npz"], "none.npz"),
         ("evaluate.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
         ("bake.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
-        ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage=a.npz", "b.npz"], "2 cages for 1 scenes"),
+        ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage", "a.npz", "b.npz"], "2 cages for 1 scenes"),
         ("make_cage.py", ["--surface=none.obj", "--out=W/c.npz"], "none.obj"),
     ],
 )
