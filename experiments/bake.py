@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.impostor_file import load_impostor, save_impostor
 from nimpostor_jax.pipeline.bake import bake
 from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
@@ -32,12 +32,7 @@ def main(argv: Sequence[str]) -> None:
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
-    saved = args.workdir / "config.gin"
-    if not saved.exists():
-        raise FileNotFoundError(
-            f"{saved} does not exist; train first (experiments/train.py --workdir={args.workdir})"
-        )
-    config = load_config([saved, *args.gin_configs], args.gin_bindings)
+    config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
     scene = prepare(config, args.data, cage=args.workdir / "cage.npz")
     start = time.perf_counter()

@@ -7,7 +7,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.blender import load_scene
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.io.scenes import resolve_scene
@@ -25,12 +25,7 @@ def main(argv: Sequence[str]) -> None:
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
-    saved = args.workdir / "config.gin"
-    if not saved.exists():
-        raise FileNotFoundError(
-            f"{saved} does not exist; train first (experiments/train.py --workdir={args.workdir})"
-        )
-    config = load_config([saved, *(args.gin_configs or [])], args.gin_bindings or [])
+    config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
     _, test = load_scene(resolve_scene(args.data), config.data)
     result = evaluate(

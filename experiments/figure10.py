@@ -9,6 +9,7 @@ Writes figure10.json (`rows`), .csv, .md and a picture of every proxy's render.
 """
 
 import argparse
+import dataclasses
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -83,10 +84,7 @@ def proxy_cage(proxy: str, scene: str, config: ExperimentConfig) -> Cage:
     train, _ = load_scene(resolve_scene(scene), config.data)
     target = PROXIES[proxy]
     if proxy == "shell":
-        envelope = config.cage.__class__(
-            target_tets=target, grid_resolution=config.cage.grid_resolution, margin=config.cage.margin
-        )
-        return cage_from_images(train, envelope)
+        return cage_from_images(train, dataclasses.replace(config.cage, target_tets=target))
     grid = visual_hull(
         train.masks, train.camera_to_world, train.focal, train.principal,
         resolution=config.cage.grid_resolution, names=train.names,

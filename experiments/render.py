@@ -12,7 +12,7 @@ import numpy as np
 
 from nimpostor_jax.edit.deform import deform
 from nimpostor_jax.export.video import write_video
-from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.blender import load_scene
 from nimpostor_jax.io.deformations import load_deformation
 from nimpostor_jax.io.images import write_png
@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     if args.frames < 1:
         raise ValueError(f"--frames must be >= 1, got {args.frames}")
-    config = load_config([args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or [])
+    config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
     if args.deformation is not None:
         impostor = deform(impostor, load_deformation(args.deformation))

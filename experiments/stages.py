@@ -20,7 +20,7 @@ import numpy as np
 from benchmark import first_camera
 
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.pipeline.evaluate import write_json
 from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> None:
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
-    config = load_config([args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or [])
+    config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
     scene = prepare(config, args.data, cage=args.workdir / "cage.npz", log=lambda _: None)
     camera = first_camera(scene, FRAME_SIZE)

@@ -256,7 +256,7 @@ class TrainConfig:
     """Optimisation of tables and decoders.
 
     `occupancy` says which cells hold something: those that rays have `seen` of late, or those whose
-    `density`, evaluated in turns, is not negligible (Instant-NGP's).
+    `density`, evaluated now and then, is not negligible (Instant-NGP's).
     """
 
     steps: int = 2000

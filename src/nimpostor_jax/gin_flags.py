@@ -101,6 +101,19 @@ def config_from_args(args: argparse.Namespace) -> ExperimentConfig:
     return load_config(args.gin_configs, args.gin_bindings)
 
 
+def config_of_run(workdir: Path, args: argparse.Namespace) -> ExperimentConfig:
+    """The config that a training run saved, with `args` of `add_flags` on top.
+
+    Raises FileNotFoundError where there is none.
+    """
+    saved = workdir / "config.gin"
+    if not saved.exists():
+        raise FileNotFoundError(
+            f"{saved} does not exist; train first (experiments/train.py --workdir={workdir})"
+        )
+    return load_config([saved, *args.gin_configs], args.gin_bindings)
+
+
 def operative_config_text(config: ExperimentConfig) -> str:
     """Every field of a config as the text of a gin file, which `load_config` reads back equal."""
     return (

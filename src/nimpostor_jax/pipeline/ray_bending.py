@@ -8,8 +8,6 @@ something (NeRF's). Location runs on the host (SciPy's KD-tree), the field under
 Axes: R rays, S samples, M points.
 """
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,7 +27,11 @@ INSIDE = -1e-6  # barycentric coordinates of points on a face, rounded
 
 
 class BentField:
-    """A Cartesian field (layout `box`) seen through a cage that has moved from `rest` to `moved`."""
+    """A Cartesian field (layout `box`) seen through a cage that has moved from `rest` to `moved`.
+
+    Vertices are in world units. Raises ValueError for a field of another layout, and for another number of
+    vertices than at rest.
+    """
 
     def __init__(
         self,
@@ -197,7 +199,7 @@ def _padded(values: np.ndarray, size: int) -> np.ndarray:
     return np.pad(values.astype(np.float32), ((0, size - len(values)), (0, 0)))
 
 
-@partial(jax.jit)
+@jax.jit
 def _query(
     impostor: NeuralImpostor, points: Float[jax.Array, "M 3"], directions: Float[jax.Array, "M 3"]
 ) -> tuple[Float[jax.Array, " M"], Float[jax.Array, "M 3"]]:

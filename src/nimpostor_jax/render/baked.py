@@ -19,7 +19,7 @@ from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.field.decoder import num_decoder_sets
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sum_by_ray, transmittance
-from nimpostor_jax.render.renderer import decode_integrated
+from nimpostor_jax.render.renderer import decode_integrated, ray_output
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables, traverse
 from nimpostor_jax.types import BakedImpostor, HashTables, Rays, RenderOutput, TetSegments
@@ -37,9 +37,9 @@ def render_baked_rays(
 ) -> RenderOutput:
     """Colour, opacity and depth of rays [R] given in world space, as `renderer.render_rays`.
 
-    Marches from tet to tet; of the config only the march's sizes matter, since nothing is sampled. Rays that
-    start within the cage see nothing of the tet in which they start. Differentiable in textures, decoders,
-    vertices and rays.
+    Marches from tet to tet; of the config only the march's sizes and `near` matter, since nothing is sampled.
+    Textures know tets from outside only: one in which a ray starts is looked up as if the ray had entered it
+    by the nearest face. Differentiable in textures, decoders, vertices and rays.
     """
     local = to_local(baked.mesh, rays)
     if tables is None:
@@ -61,15 +61,7 @@ def shade_segments(baked: BakedImpostor, rays: Rays, segments: TetSegments) -> R
     sums = sum_by_ray(light, channels, rows, num_rays * num_sets, num_used)
     directions = spherical_harmonics(rays.directions, baked.config.decoder.sh_degree)
     sums = decode_integrated(baked.decoders, sums, directions)
-    opacity, depth = sums[:, 3], sums[:, 4]
-    visible = opacity > 0
-    return RenderOutput(
-        color=sums[:, :3],
-        opacity=opacity,
-        depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * baked.mesh.scale,
-        overflow=segments.overflow,
-        coarsened=jnp.zeros_like(segments.overflow),
-    )
+    return ray_output(sums, baked.mesh.scale, segments.overflow, jnp.zeros_like(segments.overflow))
 
 
 def textured_segments(

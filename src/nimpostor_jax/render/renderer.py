@@ -121,14 +121,24 @@ def integrate_samples(
         sums = decode_integrated(impostor.decoders, sums, directions)
     else:
         sums = sum_by_ray(weights, values, samples.rays, num_rays, num_used)
+    return ray_output(sums, impostor.mesh.scale, overflow | samples.overflow, samples.coarsened)
+
+
+def ray_output(
+    sums: Float[Array, "R 5"],
+    scale: Float[Array, ""],
+    overflow: Bool[Array, " R"],
+    coarsened: Bool[Array, " R"],
+) -> RenderOutput:
+    """What rays see, from their sums by weight of colour, 1, and t, which `scale` takes to world units."""
     opacity, depth = sums[:, 3], sums[:, 4]
     visible = opacity > 0
     return RenderOutput(
         color=sums[:, :3],
         opacity=opacity,
-        depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * impostor.mesh.scale,
-        overflow=overflow | samples.overflow,
-        coarsened=samples.coarsened,
+        depth=jnp.where(visible, depth / jnp.where(visible, opacity, 1), 0) * scale,
+        overflow=overflow,
+        coarsened=coarsened,
     )
 
 

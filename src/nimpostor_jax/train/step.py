@@ -177,7 +177,7 @@ def train_step(
 def update_thickness(
     key: Array, state: TrainState, impostor: NeuralImpostor, sampler: SamplerConfig
 ) -> TrainState:
-    """Look into every second cell, in turns, at a random point (Instant-NGP, Appendix C).
+    """Look into half of the cells, the odd or the even ones, at a random point (Instant-NGP, Appendix C).
 
     A cell's thickness is the larger of what is found and of what has been known, a little forgotten. For
     `measure` euclidean and density in the same measure: a step then is as long in all cells.
