@@ -10,6 +10,7 @@ Writes figure10.json (`rows`), .csv, .md and a picture of every proxy's render.
 
 import argparse
 import dataclasses
+import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -34,7 +35,7 @@ from nimpostor_jax.io.mesh_files import save_tets
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.cage import cage_from_images
-from nimpostor_jax.preprocess.tetrahedralize import tetrahedralize
+from nimpostor_jax.preprocess.tetrahedralize import box_tets, run_ftetwild
 from nimpostor_jax.preprocess.topology import Cage
 from nimpostor_jax.preprocess.visual_hull import visual_hull
 
@@ -43,6 +44,8 @@ PROXIES = {
     "shell": 600, "box": 6, "cube": 2258,
     "sphere0": 544, "sphere1": 436, "sphere2": 1372, "sphere3": 1197,
 }  # fmt: skip
+FILL_CALLS = 8
+CLOSE_ENOUGH, TOLERATED = 0.08, 0.18  # logarithms
 COLUMNS = ("proxy", "tets", "target_tets", "psnr", "ssim", "lpips", "train_seconds", "parameters")
 
 
@@ -92,15 +95,35 @@ def proxy_cage(proxy: str, scene: str, config: ExperimentConfig) -> Cage:
     points = grid.bounds[0] + (np.argwhere(grid.occupied) + 0.5) * grid.voxel_size
     center = grid.bounds.mean(axis=0)
     diagonal = float(np.linalg.norm(np.diff(grid.bounds, axis=0)))
-    shape = _shape(proxy, points - center)
+    surface = _shape(proxy, points - center)(config.cage.margin * diagonal)
+    surface.apply_translation(center)
+    if proxy == "box":
+        return box_tets(surface.bounds)
+    return fill(surface, target, config.cage.margin * diagonal / 2)
 
-    def surface(offset: float, step: float) -> trimesh.Trimesh:
-        del step
-        moved: trimesh.Trimesh = shape(offset)
-        moved.apply_translation(center)
-        return moved
 
-    return tetrahedralize(surface, target, diagonal, config.cage.margin)
+def fill(surface: trimesh.Trimesh, target: int, epsilon: float) -> Cage:
+    """About so many tets in a simple surface; raises ValueError where no attempt is within 20 %.
+
+    `preprocess.tetrahedralize` steers the count by the surface's tolerance, which says nothing of spheres and
+    cubes. Here the length of edges does: by its cube until two attempts lie around the target, then halfway.
+    """
+    edge, attempts = 0.2, []
+    for call in range(FILL_CALLS):
+        vertices, tets = run_ftetwild(surface, epsilon, edge)
+        attempts.append((math.log(max(len(tets), 1) / target), edge, (vertices, tets)))
+        print(f"fTetWild call {call + 1}: edges of {edge:.3f}, {len(tets)} tets", flush=True)
+        off, _, best = min(attempts, key=lambda attempt: abs(attempt[0]))
+        if abs(off) < CLOSE_ENOUGH:
+            return best
+        few, many = ([a for a in attempts if (a[0] > 0) == above] for above in (False, True))
+        if few and many:
+            edge = math.sqrt(min(a[1] for a in few) * max(a[1] for a in many))
+        else:
+            edge *= math.exp(attempts[-1][0] / 3)
+    if abs(off) > TOLERATED:
+        raise ValueError(f"no cage with about {target} tets, but {len(best[1])}, in {FILL_CALLS} calls")
+    return best
 
 
 def _shape(proxy: str, points: np.ndarray) -> Callable[[float], trimesh.Trimesh]:
