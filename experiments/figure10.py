@@ -44,7 +44,9 @@ PROXIES = {
     "shell": 600, "box": 6, "cube": 2258,
     "sphere0": 544, "sphere1": 436, "sphere2": 1372, "sphere3": 1197,
 }  # fmt: skip
-FILL_CALLS = 8
+FILL_CALLS, LONG_EDGE = 16, 0.2
+EDGE_SLOPE, EPSILON_SLOPE = 5, 1.3  # the count goes about as edges**-5, or as epsilon**-1.3
+SPREAD = 0.08  # of the logarithm of edges, around the best
 CLOSE_ENOUGH, TOLERATED = 0.08, 0.18  # logarithms
 COLUMNS = ("proxy", "tets", "target_tets", "psnr", "ssim", "lpips", "train_seconds", "parameters")
 
@@ -99,28 +101,29 @@ def proxy_cage(proxy: str, scene: str, config: ExperimentConfig) -> Cage:
     surface.apply_translation(center)
     if proxy == "box":
         return box_tets(surface.bounds)
-    return fill(surface, target, config.cage.margin * diagonal / 2)
+    return fill(surface, target, config.cage.margin * diagonal / 4)
 
 
 def fill(surface: trimesh.Trimesh, target: int, epsilon: float) -> Cage:
     """About so many tets in a simple surface; raises ValueError where no attempt is within 20 %.
 
-    `preprocess.tetrahedralize` steers the count by the surface's tolerance, which says nothing of spheres and
-    cubes. Here the length of edges does: by its cube until two attempts lie around the target, then halfway.
+    `preprocess.tetrahedralize` steers the count by the surface's tolerance, which alone says nothing of
+    spheres and cubes. Here the length of edges does, and the tolerance where the surface needs more tets than
+    long edges do. The count jumps, and differs by some ten percent between equal calls: the next call is made
+    near the best.
     """
-    edge, attempts = 0.2, []
+    edge, attempts, rng = LONG_EDGE, [], np.random.default_rng(0)
     for call in range(FILL_CALLS):
         vertices, tets = run_ftetwild(surface, epsilon, edge)
-        attempts.append((math.log(max(len(tets), 1) / target), edge, (vertices, tets)))
+        attempts.append((math.log(max(len(tets), 1) / target), edge, epsilon, (vertices, tets)))
         print(f"fTetWild call {call + 1}: edges of {edge:.3f}, {len(tets)} tets", flush=True)
-        off, _, best = min(attempts, key=lambda attempt: abs(attempt[0]))
+        off, edge, epsilon, best = min(attempts, key=lambda attempt: abs(attempt[0]))
         if abs(off) < CLOSE_ENOUGH:
             return best
-        few, many = ([a for a in attempts if (a[0] > 0) == above] for above in (False, True))
-        if few and many:
-            edge = math.sqrt(min(a[1] for a in few) * max(a[1] for a in many))
+        if off > 0 and edge >= LONG_EDGE:
+            epsilon *= math.exp(off / EPSILON_SLOPE + rng.uniform(0, SPREAD))
         else:
-            edge *= math.exp(attempts[-1][0] / 3)
+            edge *= math.exp(off / EDGE_SLOPE + rng.uniform(-SPREAD, SPREAD))
     if abs(off) > TOLERATED:
         raise ValueError(f"no cage with about {target} tets, but {len(best[1])}, in {FILL_CALLS} calls")
     return best
