@@ -106,11 +106,12 @@ def face_weights(a: Sequence[Lanes], b: Sequence[Lanes], c: Sequence[Lanes]) -> 
     first, second = _tip(along)
     tip_along, q_along, r_along = _turned(first, second, along)
     tip_across, q_across, r_across = _turned(first, second, across)
-    to_q = _share(tip_along, tip_along - q_along)  # from the tip to where the cut ends
-    to_r = _share(tip_along, tip_along - r_along)
+    # From the tip to where the cut ends; an edge along the cut is all of it.
+    to_q = _share(tip_along, tip_along - q_along, 1)
+    to_r = _share(tip_along, tip_along - r_along, 1)
     end_q = tip_across + to_q * (q_across - tip_across)
     end_r = tip_across + to_r * (r_across - tip_across)
-    between = _share(end_q, end_q - end_r)
+    between = _share(end_q, end_q - end_r, 0.5)
     wq, wr = (1 - between) * to_q, between * to_r
     tip = jnp.maximum(1 - wq - wr, 0)
     return (
@@ -156,10 +157,10 @@ def _turned(first: Lanes, second: Lanes, values: Sequence[Lanes]) -> tuple[Lanes
     )
 
 
-def _share(part: Lanes, whole: Lanes) -> Lanes:
-    """part / whole in [0, 1]; 1/2 with zero gradient where the whole is 0, or so little that it is rounding.
+def _share(part: Lanes, whole: Lanes, otherwise: float) -> Lanes:
+    """part / whole in [0, 1]; a constant where the whole is 0, or so little that it is rounding.
 
     Two of these follow on each other: their slopes, multiplied, must not overflow.
     """
     valid = jnp.abs(whole) > jnp.finfo(whole.dtype).tiny ** 0.25  # 3e-10 in float32
-    return jnp.where(valid, jnp.clip(part / jnp.where(valid, whole, 1), 0, 1), 0.5)
+    return jnp.where(valid, jnp.clip(part / jnp.where(valid, whole, 1), 0, 1), otherwise)
