@@ -29,6 +29,7 @@ from ladder import (
 )
 
 from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.geometry.topology import Cage
 from nimpostor_jax.gin_flags import add_flags, run_cli
 from nimpostor_jax.io.blender import load_scene
 from nimpostor_jax.io.mesh_files import save_tets
@@ -36,7 +37,6 @@ from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.cage import cage_from_images
 from nimpostor_jax.preprocess.tetrahedralize import box_tets, run_ftetwild
-from nimpostor_jax.preprocess.topology import Cage
 from nimpostor_jax.preprocess.visual_hull import visual_hull
 
 # Tets of each proxy; the paper's PSNR lies between 32.58 and 33.24 dB for all seven.

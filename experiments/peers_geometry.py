@@ -26,8 +26,8 @@ from nimpostor_jax.config import ImpostorConfig, RenderConfig
 from nimpostor_jax.field.impostor import init_impostor
 from nimpostor_jax.geometry.locate import find_tets, locate_tables
 from nimpostor_jax.geometry.tetrahedron import FACES
+from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.preprocess.embree import EmbreeQuery, EmbreeSegments
-from nimpostor_jax.preprocess.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.preprocess.validate import orient_tets
 from nimpostor_jax.render.camera import TILE, to_local
 from nimpostor_jax.render.capacity import fit_capacities

@@ -22,7 +22,7 @@ import trimesh
 from jax.sharding import PartitionSpec as P
 
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.preprocess.validate import orient_tets
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
 from nimpostor_jax.train.sharding import AXIS, device_mesh, over_rays, replicated

@@ -27,9 +27,9 @@ from stress_meshes import kuhn_grid, unit
 from tqdm import tqdm
 
 from nimpostor_jax.config import MarchConfig
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.gin_flags import run_cli
 from nimpostor_jax.pipeline.evaluate import write_json
-from nimpostor_jax.preprocess.topology import build_tet_mesh
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.traverse import march_tables, traverse
 from nimpostor_jax.types import Camera, Rays

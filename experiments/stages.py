@@ -27,14 +27,10 @@ from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order, to_local
 from nimpostor_jax.render.capacity import ray_entries
 from nimpostor_jax.render.frame import CHUNK, frame_config
-from nimpostor_jax.render.renderer import (
-    integrate_samples,
-    occupied_samples,
-    render_rays,
-    visible_samples,
-)
+from nimpostor_jax.render.renderer import integrate_samples, render_rays
 from nimpostor_jax.render.sampling import place_samples, plan_samples
 from nimpostor_jax.render.segments import locate_segments
+from nimpostor_jax.render.selection import occupied_samples, visible_samples
 from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.step import RayBatch, loss_gradient, make_optimizer, trainable

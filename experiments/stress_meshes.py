@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 from nimpostor_jax.geometry.tetrahedron import FACES
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.preprocess.validate import orient_tets
 from nimpostor_jax.types import BoundaryFaces, TetMesh
 

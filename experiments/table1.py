@@ -27,13 +27,13 @@ from ladder import (
 )
 from PIL import Image
 
+from nimpostor_jax.geometry.topology import world_vertices
 from nimpostor_jax.gin_flags import add_flags, run_cli
 from nimpostor_jax.io.images import composite, to_uint8, write_png
 from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.evaluate import camera_of
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.pipeline.ray_bending import BentField
-from nimpostor_jax.preprocess.topology import world_vertices
 from nimpostor_jax.render.camera import TILE
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
 from nimpostor_jax.render.raster_frame import rasterize_frame

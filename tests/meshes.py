@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from scipy.spatial import Delaunay
 
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh
 
 
 def oriented(vertices, tets):

@@ -17,7 +17,7 @@ from nimpostor_jax.config import (
     SamplerConfig,
 )
 from nimpostor_jax.field.impostor import init_impostor
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.types import Camera
 
 FIELD = ImpostorConfig(

@@ -18,10 +18,8 @@ from nimpostor_jax.config import (
     RenderConfig,
     SamplerConfig,
     TrainConfig,
-    check_types,
-    from_dict,
-    to_dict,
 )
+from nimpostor_jax.config_dict import check_types, from_dict, to_dict
 
 POSITIVE = st.floats(min_value=1e-6, max_value=1e6)
 EXPERIMENTS = st.builds(

@@ -19,9 +19,8 @@ from nimpostor_jax.config import (
     RenderConfig,
     SamplerConfig,
     TrainConfig,
-    check_types,
-    to_dict,
 )
+from nimpostor_jax.config_dict import check_types, to_dict
 from nimpostor_jax.gin_flags import (
     TRACEBACK_VARIABLE,
     add_flags,

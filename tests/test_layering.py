@@ -13,7 +13,10 @@ PACKAGE = ROOT / "src" / "nimpostor_jax"
 MAX_LINES = 400
 
 # The core, lowest first: a layer imports only itself and what stands before it.
-CORE = ["config", "types", "chunks", "geometry", "encoding", "field", "render", "train", "edit", "simulate"]
+CORE = [
+    "config", "config_dict", "types", "chunks", "geometry", "encoding", "field", "render", "train", "edit",
+    "simulate",
+]  # fmt: skip
 # On top of the core, which imports none of them. Among each other they must not form a cycle.
 OUTER = ["preprocess", "io", "export", "lpips", "metrics", "gin_flags", "pipeline"]
 # Where a library may be imported: a folder (with a slash at its end) or a file.

@@ -32,7 +32,7 @@ _MODULES = {
     "pipeline.prepare": ("Scene", "prepare", "use_all_cores"),
     "pipeline.ray_bending": ("BentField",),
     "preprocess.cage": ("cage_from_images", "cage_from_surface"),
-    "preprocess.topology": ("build_tet_mesh", "world_vertices"),
+    "geometry.topology": ("build_tet_mesh", "world_vertices"),
     "render.camera": ("image_pixels", "pixel_rays"),
     "render.frame": ("frame_config", "render_frame", "to_image"),
     "render.raster_frame": ("rasterize_frame",),

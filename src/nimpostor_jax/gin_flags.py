@@ -19,7 +19,8 @@ from typing import Any, Literal, NoReturn
 import gin
 from gin import config_parser
 
-from nimpostor_jax.config import ExperimentConfig, check_types
+from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.config_dict import check_types
 
 TRACEBACK_VARIABLE = "NIMPOSTOR_TRACEBACK"
 

@@ -74,6 +74,8 @@ class TetSegments:
     lambda_enter: Float[Array, "N 4"]
     lambda_exit: Float[Array, "N 4"]
     overflow: Bool[Array, " R"]  # more tets or entries than slots: the tail is missing
+    disordered: Bool[Array, ""]  # some ray's segments overlap, or go back
+    mesh_tets: Int[Array, " N"] | None = None  # the mesh's tets, where `tet_ids` are a field's cells
 
 
 @struct.dataclass
@@ -92,6 +94,7 @@ class HashLayout:
     corner_order: Int[Array, "T 4"]  # the tet's corners by ascending vertex id
     dense_ranks: Int[Array, " nodes"]
     rank_starts: Int[Array, " D+1"]  # where the D dense levels begin in `dense_ranks`
+    num_mixed: int = struct.field(pytree_node=False, default=0)  # of these the last: hashed in some tets
 
 
 @struct.dataclass
@@ -119,15 +122,31 @@ class HashTables:
 
 
 @struct.dataclass
+class Embedding:
+    """Where a mesh's tets lie in the cells of its field: the tets for which the field's tables were made.
+
+    A cage that has been cut finer, put together or built anew moves freely while its field stays as it is.
+    """
+
+    cells: Int[Array, " T"]
+    lambdas: Float[Array, "T 4 4"]  # of the tets' corners, in their cells: [tet, corner, :]
+
+
+@struct.dataclass
 class NeuralImpostor:
-    """An editable radiance field: cage, tables, decoders (Sec. 3). A pytree of arrays and a static config."""
+    """An editable radiance field: cage, tables, decoders (Sec. 3). A pytree of arrays and a static config.
+
+    The field's T cells are the mesh's tets unless there is an `embedding`.
+    """
 
     mesh: TetMesh
     tables: HashTables
     decoders: dict[str, Any]  # every leaf has a leading axis: the stack of decoder sets
-    decoder_index: Int[Array, " T"]  # which decoder set a tet uses
+    decoder_index: Int[Array, " T"]  # which decoder set a cell uses
     config: ImpostorConfig = struct.field(pytree_node=False)
-    occupied: Bool[Array, "T cells"] | None = None  # cells of `render.occupancy` that may be seen; None: all
+    occupied: Bool[Array, "T parts"] | None = None  # parts of `render.occupancy` that may be seen; None: all
+    embedding: Embedding | None = None
+    rest_vertices: Float[Array, "V 3"] | None = None  # in the mesh's frame, before it moved; None: it has not
 
 
 @struct.dataclass

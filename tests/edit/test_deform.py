@@ -8,7 +8,7 @@ import pytest
 from nimpostor_jax.config import EncodingConfig, ImpostorConfig
 from nimpostor_jax.edit.deform import bend, deform, deformation_report, rigid, stretch, twist
 from nimpostor_jax.field.impostor import init_impostor
-from nimpostor_jax.preprocess.topology import build_tet_mesh, world_vertices
+from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 
 POINT = np.array([[0.4, -0.3, 0.7]])
 

@@ -12,7 +12,7 @@ from numpy.testing import assert_allclose
 from nimpostor_jax.config import EncodingConfig, ImpostorConfig
 from nimpostor_jax.encoding.layout import NGP_PRIMES
 from nimpostor_jax.field.impostor import features, init_impostor
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh
 
 COUNT = 40
 CONFIG = EncodingConfig(

@@ -15,7 +15,7 @@ from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.hash_grid import encode, init_features
 from nimpostor_jax.encoding.layout import build_layout
 from nimpostor_jax.geometry.tetrahedron import FACES
-from nimpostor_jax.preprocess.topology import adjacency
+from nimpostor_jax.geometry.topology import adjacency
 from nimpostor_jax.types import HashTables
 
 KINDS = list(itertools.product(["per_simplex", "per_tet"], ["grid", "simplex"]))

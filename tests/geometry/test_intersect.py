@@ -139,7 +139,7 @@ def test_face_weights_stay_in_range(rng):
 @pytest.mark.parametrize("turn", [0, 1, 2])
 @pytest.mark.parametrize("tilt", [0.0, 1e-16, -1e-16])
 def test_an_edge_along_the_cut_is_all_of_it(turn, tilt):
-    """The line passes through a corner, and an edge runs from there across the longer side, up to rounding."""
+    """The line passes through a corner, and an edge runs from there across, up to rounding."""
     corners = np.roll([[-0.4, 0.0], [tilt, 0.4], [0.0, 0.0]], turn, axis=0)
     weights = np.stack(face_weights(*(columns(corners[None, i]) for i in range(3))), axis=-1)
     assert_allclose(weights @ corners, 0, atol=1e-7)

@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial import Delaunay
 
 from nimpostor_jax.geometry.locate import locate
+from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.preprocess.embree import EmbreeQuery
-from nimpostor_jax.preprocess.topology import build_tet_mesh, world_vertices
 
 # A point may round to the wrong side of a face by this share of the cage's size: 8 ulps accepted, and the
 # world points, frame and vertices are rounded to float32 once each.

@@ -9,9 +9,9 @@ from numpy.testing import assert_allclose
 
 from nimpostor_jax.config import EncodingConfig, ImpostorConfig
 from nimpostor_jax.field.impostor import init_impostor
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.pipeline.ray_bending import BentField
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
-from nimpostor_jax.preprocess.topology import build_tet_mesh
 
 
 @pytest.fixture(scope="module")

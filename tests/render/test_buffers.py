@@ -11,7 +11,7 @@ from scenes import FIELD
 
 from nimpostor_jax.config import MarchConfig, RenderConfig, SamplerConfig
 from nimpostor_jax.field.impostor import init_impostor
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import march_tables, traverse
 

@@ -10,7 +10,7 @@ from rays import DEGENERATE, GENERIC, as_rays, by_ray
 
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry.tetrahedron import num_inverted
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.render import entries
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse

@@ -68,6 +68,7 @@ def segments_of(*rays, slots=4):
                 enter[r, k], exit_[r, k] = low, high
                 lambdas[0, r, k, 0] = lambdas[1, r, k, 1] = 1
     return TetSegments(
+        disordered=jnp.asarray(False),
         rays=jnp.repeat(jnp.arange(len(rays), dtype=jnp.int32), slots),
         tet_ids=jnp.asarray(ids.ravel(), jnp.int32),
         t_enter=jnp.asarray(enter.ravel(), jnp.float32),

@@ -12,8 +12,8 @@ from numpy.testing import assert_allclose
 from rays import as_rays, generic
 from scenes import RENDER, exact
 
-from nimpostor_jax.preprocess.subdivide import subdivide
-from nimpostor_jax.preprocess.topology import build_tet_mesh
+from nimpostor_jax.geometry.subdivide import subdivide
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.train.bake import FineCage, Moments, gather_by_tet, solve_moments
 from nimpostor_jax.train.step import RayBatch

@@ -48,8 +48,15 @@ def deform(impostor: NeuralImpostor, space_map: SpaceMap) -> NeuralImpostor:
                 f"vertex {bad[0]} at {np.asarray(world[bad[0]]).tolist()}; "
                 "restrict the map's parameters"
             )
-    vertices = ((jnp.asarray(moved, world.dtype) - mesh.center) / mesh.scale).astype(world.dtype)
-    return dataclasses.replace(impostor, mesh=dataclasses.replace(mesh, vertices=vertices))
+    # By what they move: vertices that stay keep their bits.
+    return with_vertices(impostor, mesh.vertices + (jnp.asarray(moved, world.dtype) - world) / mesh.scale)
+
+
+def with_vertices(impostor: NeuralImpostor, vertices: Float[Array, "V 3"]) -> NeuralImpostor:
+    """The impostor with its vertices, in the mesh's frame, elsewhere; remembers where they were at rest."""
+    rest = impostor.mesh.vertices if impostor.rest_vertices is None else impostor.rest_vertices
+    mesh = dataclasses.replace(impostor.mesh, vertices=vertices)
+    return dataclasses.replace(impostor, mesh=mesh, rest_vertices=rest)
 
 
 @dataclasses.dataclass(frozen=True)

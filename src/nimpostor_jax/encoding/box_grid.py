@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.interpolation import (
+    Address,
     Coordinates,
     Corners,
     Node,
@@ -49,10 +50,14 @@ class BoxGrid:
     layout: BoxLayout
 
     @property
-    def num_dense(self) -> int:
-        """How many levels, the coarsest, have an entry for every node."""
+    def runs(self) -> tuple[tuple[int, Address], ...]:
+        """Levels with an entry for every node, and hashed ones."""
         table = 1 << self.config.log2_table_size
-        return sum((resolution + 1) ** 3 <= table for resolution in self.config.resolutions)
+        num_dense = sum((resolution + 1) ** 3 <= table for resolution in self.config.resolutions)
+        return (
+            (num_dense, self.dense_address),
+            (self.config.num_levels - num_dense, self.hashed_address),
+        )
 
     def prepare(self, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]) -> Points:
         """What every level needs of points in tets."""

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.config import EncodingConfig
-from nimpostor_jax.encoding.interpolation import Coordinates, Corners, Node, Points
+from nimpostor_jax.encoding.interpolation import Address, Coordinates, Corners, Node, Points
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.types import FaceLayout
 
@@ -51,9 +51,9 @@ class FaceGrid:
     layout: FaceLayout
 
     @property
-    def num_dense(self) -> int:
-        """How many levels, the coarsest, have an entry for every node."""
-        return 1
+    def runs(self) -> tuple[tuple[int, Address], ...]:
+        """One level, with an entry for every node."""
+        return ((1, self.dense_address),)
 
     def prepare(self, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]) -> Points:
         """What every level needs of points in tets."""
@@ -90,9 +90,3 @@ class FaceGrid:
         """Table entries of texels."""
         place, row = node
         return points.places[0] + row * (row + 1) // 2 + place
-
-    def hashed_address(
-        self, level: Int[Array, ""], resolution: Int[Array, ""], points: Points, node: Node
-    ) -> Int[Array, " M"]:
-        """No level is hashed."""
-        return self.dense_address(level, resolution, points, node)

@@ -22,7 +22,7 @@ from nimpostor_jax.chunks import default_chunk, for_chunks, pad_items, put, take
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.box_grid import BoxGrid
 from nimpostor_jax.encoding.face_grid import FaceGrid
-from nimpostor_jax.encoding.interpolation import Coordinates, Corners, Grid, Node, Points
+from nimpostor_jax.encoding.interpolation import Address, Coordinates, Corners, Grid, Node, Points
 from nimpostor_jax.encoding.tet_grid import TetGrid
 from nimpostor_jax.types import BoxLayout, FaceLayout, HashLayout, HashTables
 
@@ -178,15 +178,18 @@ def _rows(features: Float[Array, "entries F"], entries: Int[Array, " M"]) -> Flo
 
 
 def _for_levels(config: EncodingConfig, grid: Grid, add_level: Callable[..., Any], carry: Any) -> Any:
-    """Fold `add_level` over the levels: first the densely stored, then the hashed ones."""
+    """Fold `add_level` over the levels, one loop for each way of finding entries."""
     resolutions = jnp.asarray(config.resolutions, jnp.int32)
+    first = 0
+    for count, address in grid.runs:
 
-    def body(level: Array, carry: Any, dense: bool) -> Any:
-        level = level.astype(jnp.int32)  # as the chunks' starts: in x64 the loop counts in 64 bits
-        resolution = resolutions[level]
-        address = grid.dense_address if dense else grid.hashed_address
-        return add_level(level, partial(grid.corners, resolution), partial(address, level, resolution), carry)
+        def body(level: Array, carry: Any, address: Address = address) -> Any:
+            level = level.astype(jnp.int32)  # as the chunks' starts: in x64 the loop counts in 64 bits
+            resolution = resolutions[level]
+            entries = partial(address, level, resolution)
+            return add_level(level, partial(grid.corners, resolution), entries, carry)
 
-    if grid.num_dense:  # a loop over none is traced too, and would read from empty ranks
-        carry = jax.lax.fori_loop(0, grid.num_dense, partial(body, dense=True), carry)
-    return jax.lax.fori_loop(grid.num_dense, config.num_levels, partial(body, dense=False), carry)
+        if count:  # a loop over none is traced too, and would read from empty ranks
+            carry = jax.lax.fori_loop(first, first + count, body, carry)
+        first += count
+    return carry

@@ -4,6 +4,7 @@ Axes: M points.
 """
 
 import itertools
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import jax
@@ -25,12 +26,16 @@ class Points:
     places: tuple[Int[Array, " M"] | UInt[Array, " M"], ...]  # what else addresses depend on
 
 
+# Level, resolution, points, nodes to table entries [M].
+Address = Callable[[Int[Array, ""], Int[Array, ""], Points, Node], Int[Array, " M"]]
+
+
 class Grid(Protocol):
     """A multi-resolution grid: the points' coordinates, the nodes around them, and the nodes' entries."""
 
     @property
-    def num_dense(self) -> int:
-        """How many levels, the coarsest, have an entry for every node."""
+    def runs(self) -> Sequence[tuple[int, Address]]:
+        """How many levels in a row, from the coarsest on, and how their nodes' table entries are found."""
 
     def coordinates(self, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]) -> Coordinates:
         """Of points in tets."""
@@ -40,16 +45,6 @@ class Grid(Protocol):
 
     def corners(self, resolution: Int[Array, ""], coordinates: Coordinates) -> Corners:
         """Weights, differentiable, and nodes around each point."""
-
-    def dense_address(
-        self, level: Int[Array, ""], resolution: Int[Array, ""], points: Points, node: Node
-    ) -> Int[Array, " M"]:
-        """Table entries of nodes at a densely stored level."""
-
-    def hashed_address(
-        self, level: Int[Array, ""], resolution: Int[Array, ""], points: Points, node: Node
-    ) -> Int[Array, " M"]:
-        """Table entries of nodes at a hashed level."""
 
 
 def multilinear_corners(resolution: Int[Array, ""], coordinates: Coordinates) -> Corners:

@@ -11,6 +11,7 @@ their region. Host code, NumPy.
 """
 
 import itertools
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +28,7 @@ NGP_PRIMES = (
 )  # Instant-NGP's, and one more for the fourth coordinate
 DENSE_RESOLUTION_LIMIT = 16  # (N + 1)^4 numbers a level must stay small beside the tables
 SIZE_BITS = 5  # a region is packed as offset << SIZE_BITS | log2(size)
+DENSE = (1 << SIZE_BITS) - 1  # in the place of log2(size), of a region that is dense at a mixed level
 
 
 def slab_half_width(config: EncodingConfig) -> int:
@@ -46,12 +48,7 @@ def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> HashLa
         ascending = np.take_along_axis(tets, order, axis=1)
         regions, entries, ranks = _per_simplex(ascending, config)
         multipliers = _vertex_multipliers(ascending)
-    if max(entries) > 1 << (31 - SIZE_BITS) or sum(entries) >= 1 << 31:
-        raise ValueError(
-            f"{sum(entries):,} table entries for {len(tets)} tets, {max(entries):,} of them in one level, "
-            f"cannot be addressed (2**31, and 2**{31 - SIZE_BITS} a level); "
-            "lower EncodingConfig.min_log2_tet_table or log2_tet_table"
-        )
+    _check_addresses(entries, len(tets))
     dense = [rank for rank in ranks if rank is not None]  # the coarsest levels: nodes grow with them
     return HashLayout(
         starts=jnp.asarray([0, *itertools.accumulate(entries)], jnp.int32),
@@ -60,6 +57,54 @@ def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> HashLa
         corner_order=jnp.asarray(order, jnp.int32),
         dense_ranks=jnp.asarray(np.concatenate([*dense, np.zeros(0, np.int64)]), jnp.int32),
         rank_starts=jnp.asarray([0, *itertools.accumulate(map(len, dense))], jnp.int32),
+    )
+
+
+def _check_addresses(entries: list[int], num_tets: int) -> None:
+    """Raise ValueError where so many entries by level cannot be addressed."""
+    if max(entries) > 1 << (31 - SIZE_BITS) or sum(entries) >= 1 << 31:
+        raise ValueError(
+            f"{sum(entries):,} table entries for {num_tets} tets, {max(entries):,} of them in one level, "
+            f"cannot be addressed (2**31, and 2**{31 - SIZE_BITS} a level); "
+            "lower EncodingConfig.min_log2_tet_table or log2_tet_table"
+        )
+
+
+def join_layouts(layouts: Sequence[HashLayout]) -> HashLayout:
+    """One layout for the tets of several, of one config but for sizes and the number of levels.
+
+    Level by level the entries of all layouts follow each other. Where one has fewer levels, a single entry
+    stands for it. Levels that are dense in some layouts and hashed in others become mixed. Raises ValueError
+    as `build_layout`.
+    """
+    num_levels = max(layout.regions.shape[0] for layout in layouts)
+    num_dense = [layout.rank_starts.shape[0] - 1 for layout in layouts]
+    always_dense = min(d - layout.num_mixed for d, layout in zip(num_dense, layouts, strict=True))
+    regions, entries = [], []
+    for level in range(num_levels):
+        columns, count = [], 0
+        for layout, dense in zip(layouts, num_dense, strict=True):
+            if level < layout.regions.shape[0]:
+                packed = np.asarray(layout.regions[level], np.int64)
+                size = int(layout.starts[level + 1] - layout.starts[level])
+                if always_dense <= level < dense - layout.num_mixed:
+                    packed = packed | DENSE
+            else:
+                packed, size = np.zeros(layout.regions.shape[1:], np.int64), 1
+            columns.append(packed + (count << SIZE_BITS))
+            count += size
+        regions.append(np.concatenate(columns))
+        entries.append(count)
+    _check_addresses(entries, len(regions[0]))
+    most = layouts[int(np.argmax(num_dense))]
+    return HashLayout(
+        starts=jnp.asarray([0, *itertools.accumulate(entries)], jnp.int32),
+        regions=jnp.asarray(np.stack(regions), jnp.int32),
+        multipliers=jnp.concatenate([layout.multipliers for layout in layouts]),
+        corner_order=jnp.concatenate([layout.corner_order for layout in layouts]),
+        dense_ranks=most.dense_ranks,
+        rank_starts=most.rank_starts,
+        num_mixed=max(num_dense) - always_dense,
     )
 
 

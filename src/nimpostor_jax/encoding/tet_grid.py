@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.encoding.interpolation import (
+    Address,
     Coordinates,
     Corners,
     Node,
@@ -21,7 +22,7 @@ from nimpostor_jax.encoding.interpolation import (
     kuhn_corners,
     multilinear_corners,
 )
-from nimpostor_jax.encoding.layout import SIZE_BITS
+from nimpostor_jax.encoding.layout import DENSE, SIZE_BITS
 from nimpostor_jax.types import HashLayout
 
 
@@ -33,9 +34,14 @@ class TetGrid:
     layout: HashLayout
 
     @property
-    def num_dense(self) -> int:
-        """How many levels, the coarsest, have an entry for every node."""
-        return self.layout.rank_starts.shape[0] - 1
+    def runs(self) -> tuple[tuple[int, Address], ...]:
+        """Levels with an entry for every node, with one for every node of some tets, and hashed ones."""
+        with_ranks, mixed = self.layout.rank_starts.shape[0] - 1, self.layout.num_mixed
+        return (
+            (with_ranks - mixed, self.dense_address),
+            (mixed, self.mixed_address),
+            (self.config.num_levels - with_ranks, self.hashed_address),
+        )
 
     def prepare(self, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]) -> Points:
         """What every level needs of points in tets."""
@@ -90,6 +96,14 @@ class TetGrid:
         log2 = (region & ((1 << SIZE_BITS) - 1)).astype(jnp.uint32)
         local = (hashed & ((jnp.uint32(1) << log2) - 1)).astype(jnp.int32)
         return self.layout.starts[level] + (region >> SIZE_BITS) + local
+
+    def mixed_address(
+        self, level: Int[Array, ""], resolution: Int[Array, ""], points: Points, node: Node
+    ) -> Int[Array, " M"]:
+        """Table entries of nodes at a level that is dense in some tets and hashed in others."""
+        dense = (self._region(level, points, node) & DENSE) == DENSE
+        arguments = level, resolution, points, node
+        return jnp.where(dense, self.dense_address(*arguments), self.hashed_address(*arguments))
 
     def _region(self, level: Int[Array, ""], points: Points, node: Node) -> Int[Array, " M"]:
         """Each node's packed region: of its tet, or of the sub-simplex that its nonzero coordinates name."""

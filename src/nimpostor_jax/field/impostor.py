@@ -1,5 +1,7 @@
 """The field: from a point in a tet to features, density and colour (Eqs. 6 and 7)."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,8 @@ from nimpostor_jax.encoding.hash_grid import encode, init_features
 from nimpostor_jax.encoding.layout import build_layout
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.field.decoder import decode_appearance, decode_density, init_decoders
+from nimpostor_jax.geometry.polar import nearest_rotation
+from nimpostor_jax.geometry.tetrahedron import corners, deformation_gradients
 from nimpostor_jax.types import BoxLayout, HashLayout, HashTables, NeuralImpostor, TetMesh
 
 
@@ -64,6 +68,27 @@ def radiance(
     return decode_appearance(
         impostor.decoders, point_features, direction_features, impostor.decoder_index[tet_ids]
     )
+
+
+def only_decoders(impostor: NeuralImpostor) -> NeuralImpostor:
+    """What `density` and `radiance` read: as `map_used`'s shared argument, the rest would cost gradients."""
+    return dataclasses.replace(
+        impostor,
+        mesh=None,  # type: ignore[arg-type]
+        tables=None,  # type: ignore[arg-type]
+        occupied=None,
+        embedding=None,
+        rest_vertices=None,
+    )
+
+
+def rest_rotations(impostor: NeuralImpostor) -> Float[Array, "T 3 3"] | None:
+    """How far each tet of the mesh has turned since it was at rest; None where it has not moved."""
+    if impostor.rest_vertices is None:
+        return None
+    mesh = impostor.mesh
+    rest, moved = (corners(vertices, mesh.tets) for vertices in (impostor.rest_vertices, mesh.vertices))
+    return nearest_rotation(deformation_gradients(rest, moved))
 
 
 def encode_directions(impostor: NeuralImpostor, directions: Float[Array, "R 3"]) -> Float[Array, "R E"]:

@@ -35,3 +35,20 @@ def signed_volumes(corner_positions: Float[Array, "*batch 4 3"]) -> Float[Array,
 def num_inverted(vertices: Float[Array, "V 3"], tets: Int[Array, "T 4"]) -> Int[Array, ""]:
     """How many tets have no positive volume: the status of a deformation (0 is healthy)."""
     return jnp.sum(signed_volumes(corners(vertices, tets)) <= 0)
+
+
+def deformation_gradients(
+    rest: Float[Array, "*batch 4 3"], moved: Float[Array, "*batch 4 3"]
+) -> Float[Array, "*batch 3 3"]:
+    """F with moved edges = F rest edges, for each tet; the identity where it is flat at rest.
+
+    The sum of the identity and of what the corners' displacements add: exact where nothing has moved.
+    """
+    edges = rest[..., 1:, :] - rest[..., :1, :]
+    change = (moved - rest)[..., 1:, :] - (moved - rest)[..., :1, :]
+    a, b, c = (edges[..., i, :] for i in range(3))
+    duals = jnp.stack([cross(b, c), cross(c, a), cross(a, b)], axis=-2)
+    volume = jnp.sum(a * duals[..., 0, :], axis=-1)[..., None, None]
+    slopes = jnp.where(volume != 0, duals / jnp.where(volume != 0, volume, 1), 0)
+    turned = jnp.sum(change[..., :, :, None] * slopes[..., :, None, :], axis=-3)
+    return jnp.eye(3, dtype=rest.dtype) + turned

@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from nimpostor_jax.config import ExperimentConfig, from_dict, to_dict
+from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.config_dict import from_dict, to_dict
 from nimpostor_jax.types import TetMesh
 
 _KEPT_STEPS = 2

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from nimpostor_jax import types
-from nimpostor_jax.config import ImpostorConfig, from_dict, to_dict
+from nimpostor_jax.config import ImpostorConfig
+from nimpostor_jax.config_dict import from_dict, to_dict
 from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.types import BakedImpostor, NeuralImpostor
 
@@ -123,6 +124,8 @@ def _pack(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return {
             type(node).__name__: [_pack(part, f"{path}/{i}", arrays) for i, part in enumerate(node)]
         }
+    if type(node) is int:
+        return {"number": node}
     is_array = isinstance(node, (jax.Array, np.ndarray))
     if not is_array or jnp.issubdtype(node.dtype, jax.dtypes.extended):
         raise ValueError(f"{path}: expected an array, got {type(node).__name__}")
@@ -149,6 +152,8 @@ def _unpack(spec: Any, arrays: dict[str, np.ndarray], config: ImpostorConfig) ->
         fields = {name: _unpack(part, arrays, config) for name, part in spec["fields"].items()}
         configured = cls in (NeuralImpostor, BakedImpostor)
         return cls(**fields, config=config) if configured else cls(**fields)
+    if "number" in spec:
+        return int(spec["number"])
     if "dict" in spec:
         return {key: _unpack(part, arrays, config) for key, part in spec["dict"].items()}
     kind = list if "list" in spec else tuple

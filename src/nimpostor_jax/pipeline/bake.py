@@ -12,18 +12,17 @@ from jaxtyping import Float, Int
 from tqdm.auto import tqdm
 
 from nimpostor_jax.config import BakeConfig, RenderConfig, TrainConfig
+from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.encoding.face_grid import NO_TEXELS, build_face_layout, num_texels
 from nimpostor_jax.geometry.tetrahedron import FACES
+from nimpostor_jax.geometry.topology import world_vertices
 from nimpostor_jax.io.blender import PosedImages
 from nimpostor_jax.pipeline.prepare import Log, Scene
-from nimpostor_jax.preprocess.subdivide import subdivide
-from nimpostor_jax.preprocess.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.render.baked import BASIS
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.frame import refined
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.bake import (
-    FineCage,
     Moments,
     add_contents,
     add_depths,
@@ -52,8 +51,9 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     gather in each of the others, and refines them on the training views. Raises ValueError where the textures
     would need more than `max_megabytes`, or faces have no area.
     """
-    cage, pixels = fine_cage(scene, config)
-    train, mesh = scene.config.train, cage.mesh
+    impostor = fine_impostor(impostor, scene.train, config)
+    train, mesh = scene.config.train, impostor.mesh
+    pixels = face_pixels(world_vertices(mesh), np.asarray(mesh.tets), scene.train)
     pool, _ = build_pool(mesh, scene.train.cameras, scene.train.images, scene.config.render.march)
     key = jax.random.key(train.seed + 2)
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
@@ -70,7 +70,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     }
     found = jnp.zeros((len(mesh.tets), 2))
     for batch in batches(LOOK_SHARE, "look"):
-        found = add[add_visible](found, impostor, cage, batch, config=render)
+        found = add[add_visible](found, impostor, batch, config=render)
     light, taken = np.asarray(found).T
     shown = taken > config.min_opacity * np.maximum(light, 1)
     resolutions = np.clip(np.ceil(config.texels_per_pixel * pixels), 1, config.max_resolution)
@@ -86,34 +86,30 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
 
     moments = no_moments(len(faces), 1)
     for batch in batches(DEPTHS_SHARE, "depths"):
-        moments = add[add_depths](moments, impostor, cage, layout, batch, config=render)
+        moments = add[add_depths](moments, impostor, layout, batch, config=render)
     depths = tables(moments)
     contents = no_moments(len(faces), 1), no_moments(len(faces), num_features)
     for batch in batches(1.0, "contents"):
-        contents = add[add_contents](contents, impostor, cage, depths, batch, config=render)
+        contents = add[add_contents](contents, impostor, depths, batch, config=render)
+    decoder_index = impostor.decoder_index
+    if impostor.embedding is not None:
+        decoder_index = decoder_index[impostor.embedding.cells]
     baked = BakedImpostor(
         mesh=mesh,
         depths=depths,
         textures=tables(*contents),
         decoders=impostor.decoders,
-        decoder_index=impostor.decoder_index[cage.parents],
+        decoder_index=decoder_index,
         config=impostor.config,
     )
     return refine(baked, pool, train, render, config, log=log)
 
 
-def fine_cage(scene: Scene, config: BakeConfig) -> tuple[FineCage, Float[np.ndarray, "U 4"]]:
-    """The scene's cage, its tets halved until they are small, and its faces' longest edges in pixels."""
-    coarse = scene.impostor.mesh
-    vertices, tets = world_vertices(coarse), np.asarray(coarse.tets)
-    longest = np.median(face_pixels(vertices, tets, scene.train))
-    fine = subdivide(vertices, tets, max(0, math.ceil(math.log2(longest / config.tet_pixels))))
-    cage = FineCage(
-        mesh=build_tet_mesh(fine.vertices, fine.tets),
-        parents=jnp.asarray(fine.parents, jnp.int32),
-        lambdas=jnp.asarray(fine.lambdas, jnp.float32),
-    )
-    return cage, face_pixels(fine.vertices, fine.tets, scene.train)
+def fine_impostor(impostor: NeuralImpostor, views: PosedImages, config: BakeConfig) -> NeuralImpostor:
+    """The impostor with its tets halved until their faces' edges are about `tet_pixels` long in the views."""
+    mesh = impostor.mesh
+    longest = np.median(face_pixels(world_vertices(mesh), np.asarray(mesh.tets), views))
+    return subdivide(impostor, max(0, math.ceil(math.log2(longest / config.tet_pixels))))
 
 
 def fit_config(mesh: TetMesh, pool: PixelPool, probe: RayBatch, config: RenderConfig) -> RenderConfig:

@@ -13,12 +13,12 @@ from jaxtyping import Float, Int
 
 from nimpostor_jax.config import ExperimentConfig, RenderConfig
 from nimpostor_jax.field.impostor import init_impostor
+from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.io.blender import PosedImages, check_masks, load_scene
 from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.preprocess.cage import Cage, cage_from_images
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
-from nimpostor_jax.preprocess.topology import build_tet_mesh
 from nimpostor_jax.preprocess.validate import (
     check_coverage,
     check_tets,

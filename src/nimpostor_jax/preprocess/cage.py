@@ -13,12 +13,12 @@ import trimesh
 from jaxtyping import Float
 
 from nimpostor_jax.config import CageConfig
+from nimpostor_jax.geometry.topology import Cage
 from nimpostor_jax.preprocess import validate
 from nimpostor_jax.preprocess.envelope import envelope_from_grid, voxelize_surface
 from nimpostor_jax.preprocess.surface import load_surface
 from nimpostor_jax.preprocess.tetrahedralize import BOX_TETS, Log, tetrahedralize
 from nimpostor_jax.preprocess.tighten import tighten
-from nimpostor_jax.preprocess.topology import Cage
 from nimpostor_jax.preprocess.visual_hull import OccupancyGrid, visual_hull
 
 _ATTEMPTS = 3

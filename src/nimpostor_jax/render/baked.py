@@ -20,8 +20,8 @@ from nimpostor_jax.field.decoder import num_decoder_sets
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sum_by_ray, transmittance
 from nimpostor_jax.render.renderer import decode_integrated, ray_output
-from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables, traverse
+from nimpostor_jax.render.segments import march_segments
+from nimpostor_jax.render.traverse import Entries, MarchTables
 from nimpostor_jax.types import BakedImpostor, HashTables, Rays, RenderOutput, TetSegments
 
 BASIS = 4  # functions of the direction
@@ -42,13 +42,7 @@ def render_baked_rays(
     by the nearest face. Differentiable in textures, decoders, vertices and rays.
     """
     local = to_local(baked.mesh, rays)
-    if tables is None:
-        tables = march_tables(baked.mesh)
-    crossings = traverse(tables, local, config.march, entries)
-    slots = config.march.capacity_per_ray or config.march.max_tets_per_ray
-    near, capacity = config.near / baked.mesh.scale, slots * rays.origins.shape[0]
-    segments = locate_segments(baked.mesh, local, crossings, near, capacity)
-    return shade_segments(baked, local, segments)
+    return shade_segments(baked, local, march_segments(baked.mesh, local, config, tables, entries))
 
 
 def shade_segments(baked: BakedImpostor, rays: Rays, segments: TetSegments) -> RenderOutput:
@@ -60,7 +54,7 @@ def shade_segments(baked: BakedImpostor, rays: Rays, segments: TetSegments) -> R
     rows = segments.rays * num_sets + baked.decoder_index[segments.tet_ids]
     sums = sum_by_ray(light, channels, rows, num_rays * num_sets, num_used)
     directions = spherical_harmonics(rays.directions, baked.config.decoder.sh_degree)
-    sums = decode_integrated(baked.decoders, sums, directions)
+    sums = decode_integrated(baked.decoders, sums, jnp.repeat(directions, num_sets, axis=0))
     return ray_output(sums, baked.mesh.scale, segments.overflow, jnp.zeros_like(segments.overflow))
 
 

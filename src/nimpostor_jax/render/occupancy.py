@@ -68,6 +68,22 @@ def in_occupied_cells(
     return occupied.reshape(-1).at[index].get(mode="promise_in_bounds")
 
 
+def coarser_cells(occupied: Bool[Array, "T C"], parts: int) -> Bool[Array, "T parts"]:
+    """The same grid with fewer cells a tet: occupied where one of those around it is.
+
+    Where the edges are not cut into a multiple of the parts asked for, everything counts as occupied.
+    """
+    fine, coarse = cell_resolution(occupied.shape[1]), cell_resolution(parts)
+    if fine % coarse:
+        return jnp.ones((occupied.shape[0], parts), bool)
+    factor = fine // coarse
+    i, j, k = (_corners(fine) // factor).T  # space = i + j + k may exceed the grid by rounding down
+    plane = np.minimum(j + k, coarse - 1)
+    space = np.minimum(i + plane, coarse - 1)
+    index = space * (space + 1) * (space + 2) // 6 + plane * (plane + 1) // 2 + np.minimum(k, plane)
+    return jnp.zeros((occupied.shape[0], parts), bool).at[:, index].max(occupied)
+
+
 def cells_of(
     tet_ids: Int[Array, " M"],
     lambdas: Float[Array, "M 4"],

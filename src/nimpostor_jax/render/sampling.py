@@ -35,6 +35,7 @@ class Samples:
     num_used: Int[Array, ""]
     overflow: Bool[Array, " R"]  # some of the ray's samples did not fit
     coarsened: Bool[Array, " R"]  # the ray needed more than S samples and got larger steps
+    mesh_tets: Int[Array, " M"] | None = None  # the mesh's tets, where `tet_ids` are a field's cells
 
 
 @struct.dataclass
@@ -131,10 +132,10 @@ def plan_samples(
 
 
 def place_samples(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]) -> Samples:
-    """The first `num_used` of the chosen samples, which ascend; differentiable in the plan's segments."""
+    """The first `num_used` of the chosen samples, by ray; differentiable in the plan's segments."""
     arrays = dataclasses.replace(plan, owners=None, overflow=None, coarsened=None)  # type: ignore[arg-type]
     columns = map_used(place, arrays, (chosen, plan.owners[chosen]), num_used)
-    tet_ids, lambdas, t, deltas, rays = columns
+    tet_ids, lambdas, t, deltas, rays, mesh_tets = columns
     return Samples(
         tet_ids=tet_ids,
         lambdas=lambdas,
@@ -144,11 +145,12 @@ def place_samples(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Arra
         num_used=num_used,
         overflow=plan.overflow,
         coarsened=plan.coarsened,
+        mesh_tets=mesh_tets,
     )
 
 
-def place(plan: SamplePlan, items: tuple[Int[Array, " M"], Int[Array, " M"]]) -> tuple[Array, ...]:
-    """Tets [M], coordinates [M, 4], t, interval lengths and rays [M] of samples (Eq. 5).
+def place(plan: SamplePlan, items: tuple[Int[Array, " M"], Int[Array, " M"]]) -> tuple:
+    """Tets [M], coordinates [M, 4], t, interval lengths, rays and (or None) mesh tets [M] of samples (Eq. 5).
 
     Samples are given by their numbers and segments. Reads neither `owners` nor the plan's flags.
     """
@@ -168,6 +170,7 @@ def place(plan: SamplePlan, items: tuple[Int[Array, " M"], Int[Array, " M"]]) ->
         t_enter + inside * (segments.t_exit[owners] - t_enter),
         (high - low) * scale * plan.density[owners],
         rays,
+        None if segments.mesh_tets is None else jnp.maximum(segments.mesh_tets[owners], 0),
     )
 
 

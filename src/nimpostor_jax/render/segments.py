@@ -6,6 +6,7 @@ derived from the tet's volume, so that slivers cost no precision.
 Axes: R rays, K tet slots of a ray, N packed segments.
 """
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -14,10 +15,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.chunks import running
+from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.geometry.intersect import face_weights, project, ray_frame
 from nimpostor_jax.geometry.tetrahedron import FACES
-from nimpostor_jax.render.traverse import CODES_PER_TET, EXIT_TRIANGLES, Crossings
-from nimpostor_jax.types import Rays, TetMesh, TetSegments
+from nimpostor_jax.render.traverse import (
+    CODES_PER_TET,
+    EXIT_TRIANGLES,
+    Crossings,
+    Entries,
+    MarchTables,
+    march_tables,
+    traverse,
+)
+from nimpostor_jax.types import Embedding, Rays, TetMesh, TetSegments
 
 ROUNDING = 8  # units in the last place of t by which a walk may go back unnoticed
 _CODES = np.arange(CODES_PER_TET)
@@ -44,7 +54,8 @@ def locate_segments(
     owners, codes = packed.rays, packed.codes
     geometry = (mesh.vertices, rays.origins, rays.directions)
     t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, owners, codes, packed.ends)
-    behind = jnp.maximum(_covered(owners, codes >= 0, t_enter, t_exit), near)
+    rounding = ROUNDING * jnp.finfo(t_exit.dtype).eps * (1 + jnp.abs(t_enter))
+    behind = jnp.maximum(_covered(owners, codes >= 0, t_enter, t_exit, rounding), near)
     used = (codes >= 0) & (t_exit > jnp.maximum(t_enter, behind))
     cut = used & (t_enter < behind)  # a division only where it counts: lengths may be next to 0
     skipped = jnp.where(cut, behind - t_enter, 0) / jnp.where(cut, t_exit - t_enter, 1)
@@ -57,6 +68,45 @@ def locate_segments(
         lambda_enter=jnp.where(used[:, None], lambda_enter + skipped * (lambda_exit - lambda_enter), 0),
         lambda_exit=jnp.where(used[:, None], lambda_exit, 0),
         overflow=packed.overflow,
+        # Walks come in the order of their entries, each without gaps: overlap shows between neighbours.
+        disordered=jnp.any(
+            (codes[1:] >= 0) & (owners[1:] == owners[:-1]) & (t_enter[1:] < t_exit[:-1] - rounding[1:])
+        ),
+    )
+
+
+def march_segments(
+    mesh: TetMesh,
+    rays: Rays,
+    config: RenderConfig,
+    tables: MarchTables | None = None,
+    entries: Entries | None = None,
+) -> TetSegments:
+    """The tets that rays [R] in the mesh's frame cross beyond the config's `near`, in buffers of its sizes.
+
+    `tables` and `entries` as in `traverse`; tables are made where there are none.
+    """
+    crossings = traverse(march_tables(mesh) if tables is None else tables, rays, config.march, entries)
+    slots = config.march.capacity_per_ray or config.march.max_tets_per_ray
+    return locate_segments(mesh, rays, crossings, config.near / mesh.scale, slots * rays.origins.shape[0])
+
+
+def in_cells(segments: TetSegments, embedding: Embedding | None) -> TetSegments:
+    """The same segments in the cells and coordinates of a field."""
+    if embedding is None:
+        return segments
+    tets = jnp.maximum(segments.tet_ids, 0)
+    corners = embedding.lambdas[tets]
+
+    def within(lambdas: Float[Array, "N 4"]) -> Float[Array, "N 4"]:
+        return jnp.sum(lambdas[:, :, None] * corners, axis=1)
+
+    return dataclasses.replace(
+        segments,
+        tet_ids=jnp.where(segments.tet_ids >= 0, embedding.cells[tets], -1),
+        lambda_enter=within(segments.lambda_enter),
+        lambda_exit=within(segments.lambda_exit),
+        mesh_tets=segments.tet_ids,
     )
 
 
@@ -93,12 +143,15 @@ def _pack(crossings: Crossings, capacity: int) -> _Packed:
 
 
 def _covered(
-    rays: Int[Array, " N"], used: Bool[Array, " N"], t_enter: Float[Array, " N"], t_exit: Float[Array, " N"]
+    rays: Int[Array, " N"],
+    used: Bool[Array, " N"],
+    t_enter: Float[Array, " N"],
+    t_exit: Float[Array, " N"],
+    rounding: Float[Array, " N"],
 ) -> Float[Array, " N"]:
     """The t up to which a slot's walk has covered the line before it; t_enter where it has not gone back."""
     if not rays.size:
         return t_enter
-    rounding = ROUNDING * jnp.finfo(t_exit.dtype).eps * (1 + jnp.abs(t_enter))
 
     def furthest() -> Float[Array, " N"]:
         # Crossings of one walk share their ends to the last bit.

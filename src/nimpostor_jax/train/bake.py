@@ -19,30 +19,20 @@ from nimpostor_jax.encoding.face_grid import ONE_LEVEL, FaceGrid
 from nimpostor_jax.render.baked import BASIS, render_baked_rays, seen_at, seen_on_face
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import blend_background, sample_weights, sum_by_ray, transmittance
-from nimpostor_jax.render.renderer import occupied_samples, sample_densities, visible_samples
 from nimpostor_jax.render.sampling import place_samples, plan_samples
-from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.traverse import march_tables, traverse
+from nimpostor_jax.render.segments import in_cells, march_segments
+from nimpostor_jax.render.selection import occupied_samples, sample_densities, visible_samples
 from nimpostor_jax.train.losses import photometric
 from nimpostor_jax.train.step import Parameters, RayBatch
-from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, NeuralImpostor, TetMesh, TetSegments
+from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, NeuralImpostor, TetSegments
 
 RIDGE = 1e-3  # of a texel's evidence, against dependence on the direction
 FACE_EVIDENCE = 0.05  # rays that a face's mean counts for in each of its texels
 
 
 @struct.dataclass
-class FineCage:
-    """The cage that is baked: its tets lie within those of the impostor's cage."""
-
-    mesh: TetMesh
-    parents: Int[Array, " U"]
-    lambdas: Float[Array, "U 4 4"]  # of its tets' corners, in their parents
-
-
-@struct.dataclass
 class Gathered:
-    """What rays gather on their way through the tets of the fine cage."""
+    """What rays gather on their way through the tets."""
 
     segments: TetSegments
     light: Float[Array, " N"]  # that reaches the segment; 0 in empty slots
@@ -52,15 +42,13 @@ class Gathered:
 
 
 def gather_by_tet(
-    impostor: NeuralImpostor, cage: FineCage, batch: RayBatch, config: RenderConfig
+    impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig
 ) -> Gathered:
-    """Sample the field along a batch of rays, and sum within each tet of the fine cage (Eq. 10)."""
+    """Sample the field along a batch of rays, and sum within each tet of the mesh (Eq. 10)."""
     local = to_local(impostor.mesh, batch.rays)
-    crossings = traverse(march_tables(cage.mesh), local, config.march, batch.entries)
-    slots = config.march.capacity_per_ray or config.march.max_tets_per_ray
-    near, capacity = config.near / impostor.mesh.scale, slots * batch.jitter.shape[0]
-    segments = locate_segments(cage.mesh, local, crossings, near, capacity)
-    plan = plan_samples(_in_parents(cage, segments), config.sampler, config.density_measure, batch.jitter)
+    segments = march_segments(impostor.mesh, local, config, entries=batch.entries)
+    in_field = in_cells(segments, impostor.embedding)
+    plan = plan_samples(in_field, config.sampler, config.density_measure, batch.jitter)
     chosen, count = occupied_samples(impostor, plan, config)
     chosen, features, count = visible_samples(impostor, plan, chosen, count, config, None)
     samples, owners = place_samples(plan, chosen, count), plan.owners[chosen]
@@ -80,30 +68,14 @@ def gather_by_tet(
     )
 
 
-def _in_parents(cage: FineCage, segments: TetSegments) -> TetSegments:
-    """The same segments in the tets and coordinates of the coarse cage."""
-    tet_ids = jnp.maximum(segments.tet_ids, 0)
-    enter, leave = (
-        jnp.sum(x[:, :, None] * cage.lambdas[tet_ids], axis=1)
-        for x in (segments.lambda_enter, segments.lambda_exit)
-    )
-    return dataclasses.replace(
-        segments,
-        tet_ids=jnp.where(segments.tet_ids >= 0, cage.parents[tet_ids], -1),
-        lambda_enter=enter,
-        lambda_exit=leave,
-    )
-
-
 def add_visible(
     found: Float[Array, "U 2"],
     impostor: NeuralImpostor,
-    cage: FineCage,
     batch: RayBatch,
     config: RenderConfig,
 ) -> Float[Array, "U 2"]:
     """Add, by tet, the light that reaches it along a batch of rays, and what it takes of that."""
-    gathered = gather_by_tet(impostor, cage, batch, config)
+    gathered = gather_by_tet(impostor, batch, config)
     values = jnp.stack([gathered.light, gathered.light * gathered.opacity], axis=1)
     return found.at[jnp.maximum(gathered.segments.tet_ids, 0)].add(values)
 
@@ -126,13 +98,12 @@ def no_moments(num_texels: int, num_channels: int) -> Moments:
 def add_depths(
     moments: Moments,
     impostor: NeuralImpostor,
-    cage: FineCage,
     layout: FaceLayout,
     batch: RayBatch,
     config: RenderConfig,
 ) -> Moments:
     """Add where on their way through the tets a batch of rays sees something, by the point of entry."""
-    gathered = gather_by_tet(impostor, cage, batch, config)
+    gathered = gather_by_tet(impostor, batch, config)
     segments, mass = gathered.segments, gathered.light * gathered.opacity
     return _add(moments, layout, segments, segments.lambda_enter, mass, gathered.share[:, None])
 
@@ -140,13 +111,12 @@ def add_depths(
 def add_contents(
     moments: tuple[Moments, Moments],
     impostor: NeuralImpostor,
-    cage: FineCage,
     depths: HashTables,
     batch: RayBatch,
     config: RenderConfig,
 ) -> tuple[Moments, Moments]:
     """Add opacity, and features by opacity, by the point where `depths` says that they are seen."""
-    gathered = gather_by_tet(impostor, cage, batch, config)
+    gathered = gather_by_tet(impostor, batch, config)
     segments = gathered.segments
     share = seen_at(depths, segments, jnp.int32(segments.rays.size))
     places = seen_on_face((), (segments.lambda_enter, segments.lambda_exit, share))

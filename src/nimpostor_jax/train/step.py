@@ -89,7 +89,7 @@ def init_state(
         # Not weakly typed, or the second step would compile again.
         last_seen = jnp.where(impostor.occupied, jnp.int32(0), jnp.int32(NEVER))
     elif cells_per_edge:
-        num_tets = impostor.mesh.tets.shape[0]
+        num_tets = impostor.decoder_index.shape[0]
         while cells_per_edge > 1 and num_tets * num_cells(cells_per_edge) > MAX_CELLS:
             cells_per_edge //= 2
         last_seen = jnp.zeros((num_tets, num_cells(cells_per_edge)), jnp.int32)
@@ -193,7 +193,7 @@ def update_thickness(
     features = field.features(impostor, tet_ids, lambdas)
     found = map_used(
         lambda shared, part: field.density(shared, *part),
-        dataclasses.replace(impostor, mesh=None, tables=None, occupied=None),  # type: ignore[arg-type]
+        field.only_decoders(impostor),
         (tet_ids, features),
         jnp.int32(chosen.size),
     )

@@ -1,5 +1,7 @@
 """From vertices and tets to a TetMesh: adjacency, search trees, the cage's own frame. Host, float64."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -88,6 +90,19 @@ def build_tet_mesh(
         center=jnp.asarray(center, dtype),
         scale=jnp.asarray(scale, dtype),
     )
+
+
+def build_in_frame(
+    mesh: TetMesh,
+    vertices: Float[np.ndarray, "V 3"],
+    tets: Int[np.ndarray, "T 4"],
+    object_ids: Int[np.ndarray, " T"] | None = None,
+) -> TetMesh:
+    """`build_tet_mesh` of vertices in another mesh's frame, which stays: kept vertices keep their bits."""
+    dtype = mesh.vertices.dtype
+    built = build_tet_mesh(vertices, tets, object_ids, dtype=dtype.name)
+    placed = jnp.asarray(vertices, dtype)
+    return dataclasses.replace(built, vertices=placed, center=mesh.center, scale=mesh.scale)
 
 
 def world_vertices(mesh: TetMesh) -> Float[np.ndarray, "V 3"]:

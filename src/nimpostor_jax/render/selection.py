@@ -1,0 +1,117 @@
+"""Which of the planned samples are worth a colour and a gradient, and in which order they come.
+
+Axes: R rays, M packed samples. Nothing here is differentiable: it chooses numbers of a `SamplePlan`.
+"""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from nimpostor_jax.chunks import map_used, pack_where
+from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.field import impostor as field
+from nimpostor_jax.render.composite import sample_weights
+from nimpostor_jax.render.occupancy import in_occupied_cells
+from nimpostor_jax.render.sampling import SamplePlan, Samples, place, place_samples
+from nimpostor_jax.types import NeuralImpostor
+
+Chosen = tuple[Int[Array, " M"], Int[Array, ""]]  # numbers of samples, by ray, and how many are meant
+
+
+def occupied_samples(impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig) -> Chosen:
+    """Samples in parts of cells that may be seen; rays that look everywhere keep all."""
+    everything = jnp.arange(plan.owners.size, dtype=jnp.int32)
+    if not config.skip_empty or impostor.occupied is None:
+        return everything, plan.num_used
+
+    def test(shared: tuple, part: tuple) -> Bool[Array, " chunk"]:
+        occupied, arrays = shared
+        tet_ids, lambdas, _, _, rays, _ = place(arrays, part)
+        keep = in_occupied_cells(occupied, tet_ids, lambdas)
+        return keep if arrays.jitter is None else keep | _explores(arrays.jitter, config.explore)[rays]
+
+    frozen = jax.lax.stop_gradient(plan)
+    return pack_where(test, (impostor.occupied, frozen), (everything, plan.owners), plan.num_used)
+
+
+def _explores(jitter: Float[Array, " R"], share: float) -> Bool[Array, " R"]:
+    """A share of the rays, by digits of their jitter that hardly move their samples: cells fill up."""
+    return (jitter * 1024) % 1 < share
+
+
+def in_order(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]) -> Int[Array, " M"]:
+    """The chosen samples along each ray, also where tets overlap (Fig. 4, intersecting).
+
+    Each entry into a cage starts a walk of its own, so that only samples of different walks can be out of
+    order. Where no two segments overlap, nothing is sorted.
+    """
+    frozen = jax.lax.stop_gradient(plan)
+
+    def sort() -> Int[Array, " M"]:
+        order = jnp.arange(chosen.size, dtype=jnp.int32)
+        t, rays = map_used(_t_and_ray, _arrays(frozen), (chosen, frozen.owners[chosen]), num_used)
+        rays = jnp.where(order < num_used, rays, jnp.iinfo(rays.dtype).max)
+        return jax.lax.sort((rays, t, chosen), num_keys=2)[2]  # stable: of equals, the first walk's
+
+    return jax.lax.cond(frozen.segments.disordered, sort, lambda: chosen)
+
+
+def _t_and_ray(plan: SamplePlan, items: tuple) -> tuple[Float[Array, " chunk"], Int[Array, " chunk"]]:
+    _, _, t, _, rays, _ = place(plan, items)
+    return t, rays
+
+
+def _arrays(plan: SamplePlan) -> SamplePlan:
+    """What `place` reads: the rest has no chunks."""
+    return dataclasses.replace(plan, owners=None, overflow=None, coarsened=None)  # type: ignore[arg-type]
+
+
+def visible_samples(
+    impostor: NeuralImpostor,
+    plan: SamplePlan,
+    chosen: Int[Array, " M"],
+    num_used: Int[Array, ""],
+    config: RenderConfig,
+    refinement: Float[Array, " R"] | None,
+) -> tuple[Int[Array, " M"], Float[Array, "M C"], Int[Array, ""]]:
+    """Those of the chosen samples that contribute at least `min_weight`, their features, and how many.
+
+    A pass without gradient: colours and gradients cost several times a density, and most samples lie in empty
+    space or behind a surface. With finer steps, samples that contribute less in proportion are kept.
+    """
+    frozen, plan = jax.lax.stop_gradient((impostor, plan))
+    samples = place_samples(plan, chosen, num_used)
+    features = field.features(frozen, samples.tet_ids, samples.lambdas, num_used)
+    sigmas = sample_densities(frozen, samples.tet_ids, features, num_used)
+    least, weights = config.min_weight, optical_weights(sigmas, samples)
+    if refinement is not None:
+        weights *= refinement[samples.rays]
+    visible, num_visible = pack_where(lambda _, weight: weight >= least, None, weights, num_used)
+    chosen, features = map_used(_rows, (chosen, features), visible, num_visible)
+    return chosen, features, num_visible
+
+
+def sample_densities(
+    impostor: NeuralImpostor,
+    tet_ids: Int[Array, " M"],
+    features: Float[Array, "M C"],
+    num_used: Int[Array, ""],
+) -> Float[Array, " M"]:
+    """Densities of the first `num_used` points (Eq. 7)."""
+    return map_used(_density, field.only_decoders(impostor), (tet_ids, features), num_used)
+
+
+def _density(decoders: NeuralImpostor, part: tuple) -> Float[Array, " chunk"]:
+    return field.density(decoders, *part)
+
+
+def optical_weights(sigmas: Float[Array, " M"], samples: Samples) -> Float[Array, " M"]:
+    """Share of its ray's light that each packed sample contributes."""
+    return sample_weights(sigmas * samples.deltas, samples.rays, samples.num_used)
+
+
+def _rows(arrays: Any, indices: Int[Array, " M"]) -> Any:
+    return jax.tree.map(lambda x: x[indices], arrays)
