@@ -30,7 +30,7 @@ from nimpostor_jax.render.frame import CHUNK, frame_config
 from nimpostor_jax.render.renderer import integrate_samples, render_rays
 from nimpostor_jax.render.sampling import place_samples, plan_samples
 from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.selection import occupied_samples, visible_samples
+from nimpostor_jax.render.selection import present_samples, visible_samples
 from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.step import RayBatch, loss_gradient, make_optimizer, trainable
@@ -113,7 +113,7 @@ def render_stages(
         "segments", lambda m, r, c: locate_segments(m, r, c, 0.0, capacity), mesh, local, crossings
     )
     plan = stage("plan", lambda s: plan_samples(s, config.sampler, config.density_measure, jitter), segments)
-    chosen, count = stage("cells", lambda i, p: occupied_samples(i, p, config), impostor, plan)
+    chosen, count = stage("cells", lambda i, p: present_samples(i, p, config), impostor, plan)
     numbers = {"planned": int(plan.num_used), "in occupied cells": int(count)}
     chosen, features, count = stage(
         "visible", lambda i, p, c, n: visible_samples(i, p, c, n, config, None), impostor, plan, chosen, count

@@ -332,6 +332,33 @@ class BakeConfig:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
+class RetrainConfig:
+    """Local retraining of the tets that an edit has changed (Sec. 4.2, Eq. 12).
+
+    Stage 1 fits tables to the old features at points, stage 2 tables and decoders to rays. Lost is what the
+    old field shows outside of the new cage.
+    """
+
+    feature_steps: int = 200
+    points_per_batch: int = 1 << 16
+    render_steps: int = 400
+    rays_per_batch: int = 4096
+    feature_rate: float = 1e-2  # of both stages' tables; falls to a tenth in the second
+    decoder_rate: float = 2e-3
+    max_lost_share: float = 0.001
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _require(self.feature_steps >= 0, self, "feature_steps", ">= 0")
+        _require(self.points_per_batch >= 1, self, "points_per_batch", ">= 1")
+        _require(self.render_steps >= 0, self, "render_steps", ">= 0")
+        _require(self.rays_per_batch >= 1, self, "rays_per_batch", ">= 1")
+        _require(self.feature_rate > 0, self, "feature_rate", "> 0")
+        _require(self.decoder_rate >= 0, self, "decoder_rate", ">= 0")
+        _require(0 <= self.max_lost_share <= 1, self, "max_lost_share", "in [0, 1]")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class ExperimentConfig:
     """One run: what the scripts read from gin files and save beside the checkpoint."""
 
@@ -341,3 +368,4 @@ class ExperimentConfig:
     render: RenderConfig = RenderConfig()
     train: TrainConfig = TrainConfig()
     bake: BakeConfig = BakeConfig()
+    retrain: RetrainConfig = RetrainConfig()

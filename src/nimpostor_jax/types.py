@@ -7,6 +7,7 @@ until `render.camera.to_local`. Barycentric coordinates and weights have no unit
 Nothing is checked in here: `__post_init__` of a pytree class runs at every unflatten.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 from flax import struct
@@ -133,6 +134,48 @@ class Embedding:
 
 
 @struct.dataclass
+class GridSolid:
+    """A solid by values on a regular grid, interpolated: inside where they are positive."""
+
+    values: Float[Array, "X Y Z"]  # at the voxels' centres; outside of the grid nothing is inside
+    world_to_grid: Float[Array, "3 4"]  # to indices of the array
+
+
+@struct.dataclass
+class FunctionSolid:
+    """A solid by a function of world points [M, 3], positive inside. Lives in memory only."""
+
+    function: Callable[[Float[Array, "M 3"]], Float[Array, " M"]] = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class ImpostorSolid:
+    """What an impostor fills: where its density exceeds a threshold (Eq. 13), object by object."""
+
+    impostor: "NeuralImpostor"
+    objects: tuple[TetMesh, ...]  # its mesh, one for each object
+    tet_ids: tuple[Int[Array, " tets"], ...]  # their tets, in its mesh
+    threshold: Float[Array, ""]
+
+
+Solid = GridSolid | FunctionSolid | ImpostorSolid
+
+
+@struct.dataclass
+class Gate:
+    """A solid that hides what is inside it, or outside of it (Eqs. 13 to 15).
+
+    It is fixed to the impostor, not to the world: it follows when the cage moves. `corners` are those of each
+    tet's cell, in world units, as the tet placed them when the gate was made.
+    """
+
+    solid: Solid
+    corners: Float[Array, "T 4 3"]
+    states: Int[Array, " T"]  # of tets: OPEN, CLOSED, or MIXED where single points must be tested
+    inside: bool = struct.field(pytree_node=False)  # what is kept
+
+
+@struct.dataclass
 class NeuralImpostor:
     """An editable radiance field: cage, tables, decoders (Sec. 3). A pytree of arrays and a static config.
 
@@ -147,6 +190,7 @@ class NeuralImpostor:
     occupied: Bool[Array, "T parts"] | None = None  # parts of `render.occupancy` that may be seen; None: all
     embedding: Embedding | None = None
     rest_vertices: Float[Array, "V 3"] | None = None  # in the mesh's frame, before it moved; None: it has not
+    gates: tuple[Gate, ...] = ()  # a point is seen where all let it
 
 
 @struct.dataclass

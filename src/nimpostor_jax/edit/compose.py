@@ -21,7 +21,7 @@ from nimpostor_jax.encoding.layout import join_layouts
 from nimpostor_jax.field.decoder import Parameters
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.render.occupancy import coarser_cells
-from nimpostor_jax.types import Embedding, HashLayout, HashTables, NeuralImpostor
+from nimpostor_jax.types import Embedding, Gate, HashLayout, HashTables, NeuralImpostor
 
 
 def compose(
@@ -69,6 +69,7 @@ def compose(
         occupied=_joined_occupancy(impostors),
         embedding=_joined_embedding(impostors, num_cells, dtype),
         rest_vertices=_joined_rest(impostors, transforms, mesh.scale),
+        gates=_joined_gates(impostors),
     )
 
 
@@ -176,6 +177,18 @@ def _joined_rest(
     return jnp.concatenate(
         [rest * (each.mesh.scale / scale) for rest, each in zip(rests, impostors, strict=True)]
     )
+
+
+def _joined_gates(impostors: Sequence[NeuralImpostor]) -> tuple[Gate, ...]:
+    """All gates; each is open for the tets of other impostors."""
+    counts = [each.mesh.tets.shape[0] for each in impostors]
+    gates = []
+    for i, each in enumerate(impostors):
+        around = sum(counts[:i]), sum(counts[i + 1 :])
+        for gate in each.gates:
+            corners = jnp.pad(gate.corners, (around, (0, 0), (0, 0)))
+            gates.append(dataclasses.replace(gate, corners=corners, states=jnp.pad(gate.states, around)))
+    return tuple(gates)
 
 
 def object_tets(impostor: NeuralImpostor, object_id: int) -> Int[np.ndarray, " tets"]:

@@ -8,11 +8,11 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from nimpostor_jax.geometry import subdivide as geometry
 from nimpostor_jax.geometry.topology import build_in_frame
-from nimpostor_jax.types import Embedding, NeuralImpostor
+from nimpostor_jax.types import Embedding, Gate, NeuralImpostor
 
 
 def subdivide(
@@ -38,7 +38,13 @@ def subdivide(
         mesh=build_in_frame(mesh, fine.vertices, fine.tets, object_ids),
         embedding=_within(impostor.embedding, fine, mesh.vertices.dtype.name),
         rest_vertices=rest,
+        gates=tuple(_by_parent(gate, fine.parents) for gate in impostor.gates),
     )
+
+
+def _by_parent(gate: Gate, parents: Int[np.ndarray, " U"]) -> Gate:
+    """A gate is a matter of cells and of the tets' maps, which the children share."""
+    return dataclasses.replace(gate, corners=gate.corners[parents], states=gate.states[parents])
 
 
 def _within(embedding: Embedding | None, fine: geometry.Subdivision, dtype: str) -> Embedding:

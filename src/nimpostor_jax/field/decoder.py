@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.config import ImpostorConfig
 
@@ -76,10 +76,26 @@ def decode_appearance(
 
 def _apply(layers: list, inputs: Float[Array, "M C"], decoder_ids: Int[Array, " M"]) -> Float[Array, "M out"]:
     num_sets = layers[0]["weight"].shape[0]
-    outputs = _mlp(layers, 0, inputs)
-    for chosen in range(1, num_sets):
-        outputs = jnp.where(decoder_ids[:, None] == chosen, _mlp(layers, chosen, inputs), outputs)
+    if num_sets == 1:
+        return _mlp(layers, 0, inputs)
+    width = layers[-1]["bias"].shape[1]
+    outputs = jnp.zeros((inputs.shape[0], width), jnp.result_type(inputs, layers[-1]["bias"]))
+    for chosen in range(num_sets):
+        outputs = _where_used(layers, chosen, inputs, decoder_ids[:, None] == chosen, outputs)
     return outputs
+
+
+def _where_used(
+    layers: list,
+    chosen: int,
+    inputs: Float[Array, "M C"],
+    here: Bool[Array, "M 1"],
+    outputs: Float[Array, "M out"],
+) -> Float[Array, "M out"]:
+    """A set costs nothing for points of which none uses it: neighbours mostly use the same."""
+    return jax.lax.cond(
+        jnp.any(here), lambda: jnp.where(here, _mlp(layers, chosen, inputs), outputs), lambda: outputs
+    )
 
 
 def _mlp(layers: list, chosen: int, inputs: Float[Array, "M C"]) -> Float[Array, "M out"]:

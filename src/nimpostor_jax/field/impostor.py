@@ -79,6 +79,7 @@ def only_decoders(impostor: NeuralImpostor) -> NeuralImpostor:
         occupied=None,
         embedding=None,
         rest_vertices=None,
+        gates=(),
     )
 
 

@@ -15,9 +15,8 @@ from nimpostor_jax.render.composite import sum_by_ray
 from nimpostor_jax.render.sampling import Samples, place_samples, plan_samples
 from nimpostor_jax.render.segments import in_cells, march_segments
 from nimpostor_jax.render.selection import (
-    in_order,
-    occupied_samples,
     optical_weights,
+    present_samples,
     sample_densities,
     visible_samples,
 )
@@ -60,8 +59,8 @@ def render_samples(
     segments = march_segments(impostor.mesh, local, config, tables, entries)
     segments = in_cells(segments, impostor.embedding)
     plan = plan_samples(segments, config.sampler, config.density_measure, jitter, refinement)
-    chosen, num_used = occupied_samples(impostor, plan, config)
-    chosen, features = in_order(plan, chosen, num_used), None
+    chosen, num_used = present_samples(impostor, plan, config)
+    features = None
     if config.min_weight > 0:
         chosen, features, num_used = visible_samples(impostor, plan, chosen, num_used, config, refinement)
     samples = place_samples(plan, chosen, num_used)

@@ -13,12 +13,19 @@ from jaxtyping import Array, Bool, Float, Int
 from nimpostor_jax.chunks import map_used, pack_where
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
+from nimpostor_jax.field.solids import CLOSED, MIXED, OPEN, is_kept
 from nimpostor_jax.render.composite import sample_weights
 from nimpostor_jax.render.occupancy import in_occupied_cells
 from nimpostor_jax.render.sampling import SamplePlan, Samples, place, place_samples
 from nimpostor_jax.types import NeuralImpostor
 
 Chosen = tuple[Int[Array, " M"], Int[Array, ""]]  # numbers of samples, by ray, and how many are meant
+
+
+def present_samples(impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig) -> Chosen:
+    """Samples in parts of cells that may be seen, and that gates let through, in order along each ray."""
+    chosen, num_used = gated_samples(impostor, plan, *occupied_samples(impostor, plan, config))
+    return in_order(plan, chosen, num_used), num_used
 
 
 def occupied_samples(impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig) -> Chosen:
@@ -40,6 +47,43 @@ def occupied_samples(impostor: NeuralImpostor, plan: SamplePlan, config: RenderC
 def _explores(jitter: Float[Array, " R"], share: float) -> Bool[Array, " R"]:
     """A share of the rays, by digits of their jitter that hardly move their samples: cells fill up."""
     return (jitter * 1024) % 1 < share
+
+
+def gated_samples(
+    impostor: NeuralImpostor, plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]
+) -> Chosen:
+    """Those of the chosen samples that the impostor's gates let through: first by tet, then by point."""
+    if not impostor.gates:
+        return chosen, num_used
+    impostor, plan = jax.lax.stop_gradient((impostor, plan))
+    states = jnp.stack([gate.states for gate in impostor.gates])
+    # The strictest of all gates' states says whether single points must be tested.
+    strictest = jnp.where(jnp.any(states == CLOSED, axis=0), CLOSED, jnp.max(states, axis=0))
+    segments = plan.segments
+    segment_tets = segments.tet_ids if segments.mesh_tets is None else segments.mesh_tets
+    by_segment = strictest[jnp.maximum(segment_tets, 0)]
+
+    def has_state(state: int) -> Any:
+        return lambda by_segment, owners: by_segment[owners] == state
+
+    owners = plan.owners[chosen]
+    doubtful, count = pack_where(has_state(MIXED), by_segment, owners, num_used)
+    places, tets = map_used(_cell_places, _arrays(plan), (chosen[doubtful], owners[doubtful]), count)
+    passes = map_used(_passes, impostor, (tets, places), count)
+    order = jnp.arange(chosen.size)
+    kept = (by_segment[owners] == OPEN) & (order < num_used)
+    kept = kept.at[jnp.where(order < count, doubtful, chosen.size)].set(passes, mode="drop")
+    indices, count = pack_where(lambda _, keep: keep, None, kept, num_used)
+    return chosen[indices], count
+
+
+def _cell_places(plan: SamplePlan, items: tuple) -> tuple[Float[Array, "chunk 4"], Int[Array, " chunk"]]:
+    tet_ids, lambdas, _, _, _, mesh_tets = place(plan, items)
+    return lambdas, tet_ids if mesh_tets is None else mesh_tets
+
+
+def _passes(impostor: NeuralImpostor, part: tuple) -> Bool[Array, " chunk"]:
+    return is_kept(impostor, *part)
 
 
 def in_order(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]) -> Int[Array, " M"]:

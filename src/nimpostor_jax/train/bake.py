@@ -21,7 +21,7 @@ from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import blend_background, sample_weights, sum_by_ray, transmittance
 from nimpostor_jax.render.sampling import place_samples, plan_samples
 from nimpostor_jax.render.segments import in_cells, march_segments
-from nimpostor_jax.render.selection import occupied_samples, sample_densities, visible_samples
+from nimpostor_jax.render.selection import present_samples, sample_densities, visible_samples
 from nimpostor_jax.train.losses import photometric
 from nimpostor_jax.train.step import Parameters, RayBatch
 from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, NeuralImpostor, TetSegments
@@ -49,7 +49,7 @@ def gather_by_tet(
     segments = march_segments(impostor.mesh, local, config, entries=batch.entries)
     in_field = in_cells(segments, impostor.embedding)
     plan = plan_samples(in_field, config.sampler, config.density_measure, batch.jitter)
-    chosen, count = occupied_samples(impostor, plan, config)
+    chosen, count = present_samples(impostor, plan, config)
     chosen, features, count = visible_samples(impostor, plan, chosen, count, config, None)
     samples, owners = place_samples(plan, chosen, count), plan.owners[chosen]
     sigmas = sample_densities(impostor, samples.tet_ids, features, count)

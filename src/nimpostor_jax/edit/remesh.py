@@ -1,0 +1,197 @@
+"""A new cage for an old field (Sec. 4.2): what still fits is kept to the last bit, the rest is trained anew.
+
+Host code, float64 but for point location. Axes: V vertices, T tets of the new cage.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from nimpostor_jax.config import RenderConfig, RetrainConfig
+from nimpostor_jax.edit.boolean import STEP, THRESHOLD
+from nimpostor_jax.edit.region import with_region
+from nimpostor_jax.edit.retrain import retrain
+from nimpostor_jax.field import impostor as field
+from nimpostor_jax.field.solids import CLOSED, MIXED, is_kept, to_cells
+from nimpostor_jax.geometry.locate import locate
+from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
+from nimpostor_jax.types import NeuralImpostor, TetMesh
+
+_INSIDE = 1e-5  # barycentric: how far beyond a face rounding may put a corner
+_PROBES = 1 << 16
+
+
+class Overlay(NamedTuple):
+    """Where a new cage's tets lie in an old cage."""
+
+    tets: Int[np.ndarray, " T"]  # the old tet that holds the whole new one, or -1
+    lambdas: Float[np.ndarray, "T 4 4"]  # of the new tet's corners in it
+    nearest: Int[np.ndarray, " T"]  # the old tet at its middle, or the nearest
+
+
+def transfer(
+    old: NeuralImpostor,
+    vertices: Float[np.ndarray, "V 3"],
+    tets: Int[np.ndarray, "T 4"],
+    render: RenderConfig,
+    config: RetrainConfig,
+    log: Callable[[str], None] = print,
+) -> NeuralImpostor:
+    """The old impostor, as it stands, in a new cage of world-space vertices and positively oriented tets.
+
+    New tets within an old one (kept or cut ones) go on in its field, exactly; the others get tables and
+    decoders of their own and two-stage retraining. Raises ValueError for a bad mesh, cages that do not
+    overlap, or where more than `config.max_lost_share` of what the old field shows lies outside the new cage.
+    """
+    if old.gates:
+        raise ValueError("consolidate live Boolean operations before the impostor is remeshed")
+    mesh = old.mesh
+    local = (np.asarray(vertices, np.float64) - np.asarray(mesh.center)) / np.float64(mesh.scale)
+    # Vertices that are the old ones keep their bits.
+    distance, twin = cKDTree(np.asarray(mesh.vertices, np.float64)).query(local)
+    local = np.where((distance < 1e-6)[:, None], np.asarray(mesh.vertices, np.float64)[twin], local)
+    new_mesh = build_in_frame(mesh, local, tets)
+    lost = lost_share(old, new_mesh)
+    log(f"{lost:.3%} of what the field shows lies outside the new cage")
+    if lost > config.max_lost_share:
+        raise ValueError(
+            f"{lost:.2%} of what the old field shows lies outside the new cage, more than "
+            f"RetrainConfig.max_lost_share = {config.max_lost_share:.2%}; enlarge the cage or raise the limit"
+        )
+    over = overlay(old, local, np.asarray(tets))
+    cells = np.where(over.tets >= 0, _cells(old, over.tets), -1)
+    lambdas = over.lambdas
+    if old.embedding is not None:
+        lambdas = lambdas @ np.asarray(old.embedding.lambdas, np.float64)[np.maximum(over.tets, 0)]
+    new, region = with_region(old, new_mesh, cells, lambdas, _cells(old, over.nearest))
+    if old.rest_vertices is not None:
+        new = dataclasses.replace(new, rest_vertices=_at_rest(old, local, np.asarray(tets), over.nearest))
+    log(f"{len(tets)} tets, {region.tets.size} of them to be trained")
+    return retrain(old, new, region, render, config, log)
+
+
+def consolidate(
+    live: NeuralImpostor,
+    render: RenderConfig,
+    config: RetrainConfig,
+    log: Callable[[str], None] = print,
+) -> NeuralImpostor:
+    """The result of live Boolean operations as a plain field (Eq. 15): no gates, nothing but what is seen.
+
+    Tets that gates close are taken away, tets that they cut are trained anew, all others stay as they are.
+    Raises ValueError where everything is hidden.
+    """
+    if not live.gates:
+        return live
+    mesh, tets = live.mesh, np.asarray(live.mesh.tets)
+    states = np.stack([np.asarray(gate.states) for gate in live.gates])
+    shown = ~np.any(states == CLOSED, axis=0) & ~_empty_of(live, np.any(states == MIXED, axis=0))
+    if not shown.any():
+        raise ValueError("the operation hides everything: there is nothing to consolidate")
+    cut = np.any(states == MIXED, axis=0)[shown]
+    used, inverse = np.unique(tets[shown], return_inverse=True)
+    new_mesh = build_in_frame(
+        mesh,
+        np.asarray(mesh.vertices)[used],
+        inverse.reshape(-1, 4),
+        np.asarray(mesh.object_ids)[shown],
+    )
+    old_cells = _cells(live, np.flatnonzero(shown))
+    places = np.broadcast_to(np.eye(4), (shown.sum(), 4, 4))
+    if live.embedding is not None:
+        places = np.asarray(live.embedding.lambdas, np.float64)[shown]
+    new, region = with_region(live, new_mesh, np.where(cut, -1, old_cells), places, old_cells)
+    # Objects may overlap: where a point is in the old mesh is known, and must not be sought.
+    region = dataclasses.replace(region, sources=jnp.asarray(np.flatnonzero(shown)[cut], jnp.int32))
+    if live.rest_vertices is not None:
+        new = dataclasses.replace(new, rest_vertices=live.rest_vertices[used])
+    log(f"{shown.sum()} of {len(tets)} tets remain, {region.tets.size} of them to be trained")
+    return retrain(live, new, region, render, config, log)
+
+
+def _empty_of(live: NeuralImpostor, cut: Bool[np.ndarray, " T"]) -> Bool[np.ndarray, " T"]:
+    """Tets that are cut, and of which a cloud of points finds nothing left."""
+    rng = np.random.default_rng(0)
+    left = np.zeros(len(cut), bool)
+    rows = np.flatnonzero(cut)
+    test = jax.jit(is_kept)
+    for _ in range(64 if len(rows) else 0):
+        lambdas = jnp.asarray(rng.dirichlet(np.ones(4), len(rows)), live.mesh.vertices.dtype)
+        tets = jnp.asarray(rows, jnp.int32)
+        left[rows] |= np.asarray(test(live, tets, to_cells(live.embedding, tets, lambdas)[1]))
+    return cut & ~left
+
+
+def _cells(impostor: NeuralImpostor, tets: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """The cells of tets (of tet 0 where there is none)."""
+    held = np.maximum(tets, 0)
+    return held if impostor.embedding is None else np.asarray(impostor.embedding.cells)[held]
+
+
+def overlay(
+    old: NeuralImpostor, local: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]
+) -> Overlay:
+    """Which new tets lie within single old ones, as both stand; vertices in the old mesh's frame."""
+    corners = local[tets]
+    middles = corners.mean(axis=1)
+    world = np.asarray(old.mesh.center) + np.float64(old.mesh.scale) * middles
+    found = np.asarray(locate(old.mesh, jnp.asarray(world, old.mesh.vertices.dtype))[0])
+    old_corners = np.asarray(old.mesh.vertices, np.float64)[np.asarray(old.mesh.tets)]
+    _, near = cKDTree(old_corners.mean(axis=1)).query(middles)
+    nearest = np.where(found >= 0, found, near)
+    edges = (old_corners[:, 1:] - old_corners[:, :1])[nearest]  # [T, 3, 3], rows are edges
+    flat = np.abs(np.linalg.det(edges)) <= 0
+    edges = np.where(flat[:, None, None], np.eye(3), edges)
+    last = np.einsum("tcx,txe->tce", corners - old_corners[nearest][:, :1], np.linalg.inv(edges))
+    lambdas = np.concatenate([1 - last.sum(axis=2, keepdims=True), last], axis=2)
+    near_whole = np.abs(lambdas - np.rint(lambdas)) < _INSIDE
+    lambdas = np.where(near_whole, np.rint(lambdas), lambdas)
+    within = (found >= 0) & ~flat & np.all(lambdas >= 0, axis=(1, 2))
+    return Overlay(tets=np.where(within, nearest, -1), lambdas=lambdas, nearest=nearest)
+
+
+def _at_rest(
+    old: NeuralImpostor,
+    local: Float[np.ndarray, "V 3"],
+    tets: Int[np.ndarray, "T 4"],
+    nearest: Int[np.ndarray, " T"],
+) -> jnp.ndarray:
+    """Where new vertices were before the old cage moved: by the old tet around one of their tets."""
+    owner = np.zeros(len(local), int)
+    owner[tets.reshape(-1)] = np.repeat(nearest, 4)
+    old_tets = np.asarray(old.mesh.tets)[owner]
+    moved, rest = (
+        np.asarray(x, np.float64)[old_tets] for x in (old.mesh.vertices, old.rest_vertices)
+    )  # [V, 4, 3]
+    inverse = np.linalg.pinv(moved[:, 1:] - moved[:, :1])
+    weights = np.einsum("vx,vxe->ve", local - moved[:, 0], inverse)
+    placed = rest[:, 0] + np.einsum("ve,vex->vx", weights, rest[:, 1:] - rest[:, :1])
+    return jnp.asarray(placed, old.mesh.vertices.dtype)
+
+
+def lost_share(old: NeuralImpostor, new_mesh: TetMesh, threshold: float = THRESHOLD) -> float:
+    """Share of the volume that the old field fills (Eq. 13) but the new cage does not hold, by points."""
+    rng = np.random.default_rng(0)
+    corners = world_vertices(old.mesh)[np.asarray(old.mesh.tets)]
+    volumes = np.maximum(np.linalg.det(corners[:, 1:] - corners[:, :1]), 0)
+    tets = rng.choice(len(volumes), _PROBES, p=volumes / volumes.sum())
+    lambdas = rng.dirichlet(np.ones(4), _PROBES)
+    points = np.einsum("nc,ncx->nx", lambdas, corners[tets])
+    dtype = old.mesh.vertices.dtype
+    cells, places = to_cells(old.embedding, jnp.asarray(tets, jnp.int32), jnp.asarray(lambdas, dtype))
+    filled = np.asarray(_densities(old, cells, places)) * STEP > threshold
+    outside = np.asarray(locate(new_mesh, jnp.asarray(points, dtype))[0]) < 0
+    if outside.all():
+        raise ValueError("the new cage does not overlap the old one; are both in the same world coordinates?")
+    return float(np.sum(filled & outside)) / max(int(np.sum(filled)), 1)
+
+
+@jax.jit
+def _densities(impostor: NeuralImpostor, cells: jax.Array, places: jax.Array) -> jax.Array:
+    return field.density(impostor, cells, field.features(impostor, cells, places))

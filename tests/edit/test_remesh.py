@@ -1,0 +1,162 @@
+"""edit.remesh, edit.retrain, edit.region: what fits is kept, the rest is trained, nothing else changes."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes
+from meshes import MESHES
+from numpy.testing import assert_allclose, assert_array_equal
+
+from nimpostor_jax.config import RetrainConfig
+from nimpostor_jax.edit.boolean import gated, union
+from nimpostor_jax.edit.deform import deform, stretch, twist
+from nimpostor_jax.edit.region import Region, trained_part, with_trained_part
+from nimpostor_jax.edit.remesh import consolidate, overlay, transfer
+from nimpostor_jax.edit.subdivide import subdivide
+from nimpostor_jax.geometry.topology import world_vertices
+from nimpostor_jax.render.camera import image_pixels, pixel_rays
+from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.types import FunctionSolid
+
+CONFIG = dataclasses.replace(
+    scenes.exact(max_samples_per_ray=64, step=0.25),
+    march=dataclasses.replace(scenes.RENDER.march, max_tets_per_ray=48, max_entries_per_ray=6),
+)
+QUICK = RetrainConfig(feature_steps=20, points_per_batch=4096, render_steps=60, rays_per_batch=512)
+render = jax.jit(render_rays, static_argnames="config")
+
+
+def picture(impostor):
+    camera = scenes.camera(24, 18)
+    rays = pixel_rays(camera, image_pixels(18, 24).reshape(-1, 2))
+    output = render(impostor, rays, CONFIG)
+    assert not output.overflow.any()
+    return np.asarray(output.color + (1 - output.opacity)[:, None])
+
+
+def psnr(a, b):
+    return -10 * np.log10(np.mean((a - b) ** 2))
+
+
+def quiet(_):
+    pass
+
+
+def one_vertex_moved(made):
+    """The same cage, but for one inner vertex: the tets around it are other tets now."""
+    vertices, tets = world_vertices(made.mesh), np.asarray(made.mesh.tets)
+    chosen = np.bincount(tets.reshape(-1)).argmax()
+    moved = vertices.copy()
+    moved[chosen] += 0.04
+    return moved, tets, np.any(tets == chosen, axis=1)
+
+
+def test_a_local_change_leaves_all_other_tets_their_bits():
+    made = scenes.impostor("delaunay")
+    vertices, tets, touched = one_vertex_moved(made)
+    config = dataclasses.replace(QUICK, max_lost_share=1.0)
+    new = transfer(made, vertices, tets, CONFIG, config, quiet)
+    cells = np.asarray(new.embedding.cells)
+    assert_array_equal(np.flatnonzero(cells >= len(made.mesh.tets)), np.flatnonzero(touched))
+    assert_array_equal(cells[~touched], np.flatnonzero(~touched))
+    # Tables: level by level the old entries come first. Decoders: the old set is the first.
+    old_starts, new_starts = (np.asarray(x.tables.layout.starts) for x in (made, new))
+    for level in range(len(old_starts) - 1):
+        size = old_starts[level + 1] - old_starts[level]
+        mine = new.tables.features[new_starts[level] : new_starts[level] + size]
+        assert_array_equal(mine, made.tables.features[old_starts[level] : old_starts[level + 1]])
+    for ours, theirs in zip(jax.tree.leaves(new.decoders), jax.tree.leaves(made.decoders), strict=True):
+        assert_array_equal(ours[:1], theirs)
+    assert not np.allclose(new.decoders["density"][0]["weight"][1], made.decoders["density"][0]["weight"][0])
+    index = np.asarray(new.decoder_index)[cells]
+    assert_array_equal(index, touched.astype(int))
+
+
+def test_retraining_brings_the_picture_back():
+    made = scenes.impostor("delaunay")
+    vertices, tets, _ = one_vertex_moved(made)
+    config = dataclasses.replace(QUICK, max_lost_share=1.0)
+    untrained = dataclasses.replace(config, feature_steps=0, render_steps=0)
+    features = dataclasses.replace(config, feature_steps=60, render_steps=0)
+    target = picture(made)
+    found = [
+        psnr(picture(transfer(made, vertices, tets, CONFIG, c, quiet)), target)
+        for c in (untrained, features, config)
+    ]
+    assert found[2] > found[0] + 2 and found[2] > 25, found
+    assert found[1] > found[0] - 1, found
+
+
+def test_cut_tets_go_on_in_the_old_field_exactly():
+    """A new cage that only cuts old tets needs no training, whoever made it."""
+    made = scenes.impostor("blobs")
+    fine = subdivide(made)
+    vertices, tets = world_vertices(fine.mesh), np.asarray(fine.mesh.tets)
+    over = overlay(made, np.asarray(fine.mesh.vertices, np.float64), tets)
+    assert_array_equal(over.tets, fine.embedding.cells)
+    new = transfer(made, vertices, tets, CONFIG, QUICK, quiet)
+    assert new.tables.features.shape == made.tables.features.shape
+    assert_allclose(picture(new), picture(made), atol=1e-4)
+
+
+def test_a_moved_cage_is_remeshed_where_it_stands():
+    made = deform(scenes.impostor("delaunay"), twist(0.5))
+    vertices, tets, _ = one_vertex_moved(made)
+    config = dataclasses.replace(QUICK, max_lost_share=1.0, feature_steps=0, render_steps=0)
+    new = transfer(made, vertices, tets, CONFIG, config, quiet)
+    kept = np.all(np.abs(world_vertices(made.mesh) - vertices) < 1e-9, axis=1)
+    assert_allclose(new.rest_vertices[kept], made.rest_vertices[kept], atol=1e-5)
+    assert np.isfinite(new.rest_vertices).all()
+    again = deform(new, stretch(0.1, 1.0))
+    assert np.isfinite(picture(again)).all()
+
+
+def test_consolidating_a_difference():
+    made = scenes.impostor("delaunay")
+    center = world_vertices(made.mesh).mean(axis=0).astype(np.float32)
+    ball = FunctionSolid(lambda x: 0.3**2 - jnp.sum((x - center) ** 2, axis=-1))
+    live = gated(made, ball, keep_inside=False)
+    plain = consolidate(live, CONFIG, dataclasses.replace(QUICK, render_steps=150), quiet)
+    assert not plain.gates
+    before, after = (psnr(picture(x), picture(live)) for x in (made, plain))
+    assert after > before + 3 and after > 24, (before, after)
+
+
+def test_consolidating_overlapping_objects():
+    """Of a point in two tets, each object's own field is learned."""
+    first, second = scenes.impostor("cube", seed=1), scenes.impostor("cube", seed=2)
+    corner = FunctionSolid(lambda x: 0.5 - x[:, 0])
+    live = union(gated(first, corner, keep_inside=True), second)
+    plain = consolidate(live, CONFIG, dataclasses.replace(QUICK, render_steps=100), quiet)
+    assert_array_equal(np.unique(plain.mesh.object_ids), [0, 1])
+    assert psnr(picture(plain), picture(live)) > 22
+
+
+def test_a_part_taken_out_and_put_back_changes_nothing():
+    made = scenes.impostor("delaunay")
+    vertices, tets, _ = one_vertex_moved(made)
+    config = dataclasses.replace(QUICK, max_lost_share=1.0, feature_steps=0, render_steps=0)
+    new = transfer(made, vertices, tets, CONFIG, config, quiet)
+    region = Region(tets=jnp.arange(2), entries=jnp.array([3, 5, 8]), decoder_sets=jnp.array([1]))
+    same = with_trained_part(new, region, trained_part(new, region))
+    for ours, theirs in zip(jax.tree.leaves(same), jax.tree.leaves(new), strict=True):
+        assert_array_equal(ours, theirs)
+
+
+def test_bad_input():
+    made = scenes.impostor("cube")
+    vertices, tets = MESHES["cube"]()
+    with pytest.raises(ValueError, match="does not overlap"):
+        transfer(made, vertices + 10, tets, CONFIG, QUICK, quiet)
+    with pytest.raises(ValueError, match=r"lies outside the new cage, more than .*max_lost_share"):
+        transfer(made, 0.8 * vertices, tets, CONFIG, QUICK, quiet)
+    with pytest.raises(ValueError, match="inverted or flat"):
+        transfer(made, vertices, np.asarray(tets)[:, [1, 0, 2, 3]], CONFIG, QUICK, quiet)
+    live = gated(made, FunctionSolid(lambda x: x[:, 0] - 50), keep_inside=True)
+    with pytest.raises(ValueError, match="consolidate live"):
+        transfer(live, vertices, tets, CONFIG, QUICK, quiet)
+    with pytest.raises(ValueError, match="hides everything"):
+        consolidate(live, CONFIG, QUICK, quiet)
