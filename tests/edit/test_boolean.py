@@ -125,7 +125,7 @@ def test_rays_see_what_is_left(operation, keep):
     """Cut samples: the same of a union, whose parts are several objects in one place."""
     cut = operation(shape(ball_a), shape(ball_b))
     expected = chords(keep)
-    # Steps are 0.04 of the barycentric measure, 0.02 or so in length, and up to four ends of chords lie in one.
+    # Steps are 0.04 of the barycentric measure, 0.02 or so in length; up to four ends of chords lie in one.
     assert_allclose(depths(cut), expected, atol=0.05)
     assert expected.max() > 0.15 and np.mean(expected > 0) > 0.05
     together = union(cut, shape(ball_b), color="blend")

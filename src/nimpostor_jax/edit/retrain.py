@@ -33,7 +33,7 @@ from nimpostor_jax.render.occupancy import cells_of, in_occupied_cells
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.step import make_optimizer
-from nimpostor_jax.types import NeuralImpostor, Rays
+from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
 
 EMPTY_LOG_DENSITY = -8.0  # a density that no sampling step can see
 START_BATCHES = 16  # of points, for the first guess of tables and of what is occupied
@@ -151,13 +151,8 @@ def draw_points(
     count: int,
 ) -> Points:
     """Points spread evenly over the region's volume, located in the old mesh (Eq. 12, stage 1)."""
-    choice_key, place_key = jax.random.split(key)
-    mesh = new.mesh
-    positions = corners(mesh.vertices, mesh.tets[region.tets])
-    volumes = jnp.maximum(signed_volumes(positions), 0)
-    chosen = jax.random.categorical(choice_key, jnp.log(volumes), shape=(count,))
-    lambdas = jax.random.dirichlet(place_key, jnp.ones(4), (count,)).astype(positions.dtype)
-    world = mesh.center + mesh.scale * jnp.sum(lambdas[:, :, None] * positions[chosen], axis=1)
+    chosen, lambdas, local = _random_points(key, new.mesh, region, count)
+    world = new.mesh.center + new.mesh.scale * local
     if region.sources is None:
         found, places = locate(old.mesh, world, source)
     else:
@@ -173,19 +168,28 @@ def draw_points(
 
 def draw_rays(key: Array, new: NeuralImpostor, region: Region, *, count: int) -> Rays:
     """World rays from outside through points of the region, from all sides."""
-    choice_key, place_key, side_key = jax.random.split(key, 3)
+    point_key, side_key = jax.random.split(key)
     mesh = new.mesh
-    positions = corners(mesh.vertices, mesh.tets[region.tets])
-    volumes = jnp.maximum(signed_volumes(positions), 0)
-    chosen = jax.random.categorical(choice_key, jnp.log(volumes), shape=(count,))
-    lambdas = jax.random.dirichlet(place_key, jnp.ones(4), (count,)).astype(positions.dtype)
-    local = jnp.sum(lambdas[:, :, None] * positions[chosen], axis=1)
-    directions = jax.random.normal(side_key, (count, 3), positions.dtype)
+    _, _, local = _random_points(point_key, mesh, region, count)
+    directions = jax.random.normal(side_key, (count, 3), local.dtype)
     directions /= jnp.linalg.norm(directions, axis=1, keepdims=True)
     reach = 2 * jnp.max(jnp.linalg.norm(mesh.vertices, axis=1))
     return Rays(
         origins=mesh.center + mesh.scale * (local - reach * directions), directions=directions
     )
+
+
+def _random_points(
+    key: Array, mesh: TetMesh, region: Region, count: int
+) -> tuple[Int[Array, " M"], Float[Array, "M 4"], Float[Array, "M 3"]]:
+    """Which of the region's tets, where in it, and the place in the mesh's frame; even over the volume."""
+    choice_key, place_key = jax.random.split(key)
+    positions = corners(mesh.vertices, mesh.tets[region.tets])
+    volumes = jnp.maximum(signed_volumes(positions), 0)
+    chosen = jax.random.choice(choice_key, region.tets.size, (count,), p=volumes / jnp.sum(volumes))
+    shares = jax.random.exponential(place_key, (count, 4), positions.dtype)
+    lambdas = shares / jnp.sum(shares, axis=1, keepdims=True)
+    return chosen.astype(jnp.int32), lambdas, jnp.sum(lambdas[:, :, None] * positions[chosen], axis=1)
 
 
 @jax.jit

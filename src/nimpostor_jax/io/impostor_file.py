@@ -24,7 +24,7 @@ Impostor = TypeVar("Impostor", NeuralImpostor, BakedImpostor)
 
 _FORMAT = "nimpostor_jax.NeuralImpostor"
 _FORMAT_VERSION = 2  # 1 had one array of features a level
-_HEADER = "header.json"
+_HEADER, _ROOT = "header.json", "impostor"
 # What NumPy, zipfile and zlib raise for a file that is cut short, changed, or something else.
 _DAMAGE = (
     OSError, EOFError, ValueError, LookupError, TypeError, AttributeError, NotImplementedError,
@@ -48,7 +48,7 @@ def save_impostor(path: str | Path, impostor: NeuralImpostor | BakedImpostor) ->
     if Path(path).suffix != ".npz":
         raise ValueError(f"{path}: the suffix of an impostor file must be .npz")
     arrays: dict[str, np.ndarray] = {}
-    structure = _pack(impostor, "impostor", arrays)
+    structure = _pack(impostor, _ROOT, arrays)
     header = {
         "format": _FORMAT,
         "version": _FORMAT_VERSION,
@@ -110,10 +110,13 @@ def _pack(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return None
     if type(node) in _RECORDS.values():
         names = [field.name for field in dataclasses.fields(node)]
+        result: dict[str, Any] = {"record": type(node).__name__}
         if type(node) in (NeuralImpostor, BakedImpostor):
-            names.remove("config")  # in the header
-        parts = {name: _pack(getattr(node, name), f"{path}/{name}", arrays) for name in names}
-        return {"record": type(node).__name__, "fields": parts}
+            names.remove("config")
+            if path != _ROOT:  # one that a gate looks into; the file's own is in the header
+                result["config"] = to_dict(node.config)
+        fields = {name: _pack(getattr(node, name), f"{path}/{name}", arrays) for name in names}
+        return result | {"fields": fields}
     if isinstance(node, dict):
         if not all(isinstance(key, str) and "/" not in key for key in node):
             raise ValueError(f"{path}: keys must be text without '/', got {list(node)}")
@@ -124,8 +127,10 @@ def _pack(node: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         return {
             type(node).__name__: [_pack(part, f"{path}/{i}", arrays) for i, part in enumerate(node)]
         }
-    if type(node) is int:
+    if type(node) in (bool, int):
         return {"number": node}
+    if callable(node):
+        raise ValueError(f"{path} is a function, which no file can hold; sample it on a grid (GridSolid)")
     is_array = isinstance(node, (jax.Array, np.ndarray))
     if not is_array or jnp.issubdtype(node.dtype, jax.dtypes.extended):
         raise ValueError(f"{path}: expected an array, got {type(node).__name__}")
@@ -149,11 +154,13 @@ def _unpack(spec: Any, arrays: dict[str, np.ndarray], config: ImpostorConfig) ->
         return placed
     if "record" in spec:
         cls = _RECORDS[spec["record"]]
-        fields = {name: _unpack(part, arrays, config) for name, part in spec["fields"].items()}
         configured = cls in (NeuralImpostor, BakedImpostor)
+        if "config" in spec:
+            config = from_dict(ImpostorConfig, spec["config"])
+        fields = {name: _unpack(part, arrays, config) for name, part in spec["fields"].items()}
         return cls(**fields, config=config) if configured else cls(**fields)
     if "number" in spec:
-        return int(spec["number"])
+        return spec["number"]
     if "dict" in spec:
         return {key: _unpack(part, arrays, config) for key, part in spec["dict"].items()}
     kind = list if "list" in spec else tuple
