@@ -35,6 +35,7 @@ def ends(cage=COLUMN):
 
 def strain_energy(rest, tets, moved):
     """The documented energy in NumPy, by SVD: squared distance of singular values from 1."""
+
     def edges(v):
         return np.swapaxes(v[tets[:, 1:]] - v[tets[:, :1]], 1, 2)
 
@@ -45,17 +46,16 @@ def strain_energy(rest, tets, moved):
     return np.sum(volumes * np.sum((stretches - 1) ** 2, axis=1)) / volumes.sum()
 
 
-@pytest.mark.parametrize("name", ["one_tet", "cube", "delaunay", "nonconvex"])
+@pytest.mark.parametrize("name", ["one_tet", "delaunay"])
 def test_a_rigid_motion_of_the_handles_moves_everything(name):
     impostor = impostor_of(MESHES[name]())
     rest = world_vertices(impostor.mesh)
-    inside = np.asarray(rest)[np.asarray(impostor.mesh.tets)].mean(axis=1)[:4]
-    handles = make_handles(impostor.mesh, vertices=[0, 1, 3], points=inside)
-    at_rest = np.concatenate([rest[[0, 1, 3]], inside])
+    inside = rest[np.asarray(impostor.mesh.tets)[0]].mean(axis=0)
+    handles = make_handles(impostor.mesh, vertices=[0, 1, 3], points=[inside])
+    at_rest = np.stack([*rest[[0, 1, 3]], inside])
     moved, status = fit_cage(impostor, handles, at_rest @ ROTATION.T + SHIFT)
-    # float32 positions of size 5; the solver stops where a step is below 1e-5 half diagonals.
-    scale = float(impostor.mesh.scale)
-    np.testing.assert_allclose(world_vertices(moved.mesh), rest @ ROTATION.T + SHIFT, atol=5e-5 * max(scale, 1))
+    # float32: a hundred roundings of coordinates up to 6 (the best rigid start is nearly exact by itself).
+    np.testing.assert_allclose(world_vertices(moved.mesh), rest @ ROTATION.T + SHIFT, atol=5e-5)
     assert status.converged and status.num_inverted == 0 and status.energy < 1e-8
     assert moved.tables is impostor.tables
 
@@ -70,30 +70,32 @@ def test_targets_at_rest_change_nothing(column):
 
 def test_two_handles_and_one_move_without_strain(column):
     """Rotations that one or two handles leave open are decided without NaN and without strain."""
-    for ids, targets in (([0], [[5.0, 5.0, 5.0]]), ([0, 15], [[0.0, 0.0, 0.0], [19**0.5, 0.0, 0.0]])):
-        rest = world_vertices(column.mesh)
-        if len(ids) == 2:
-            targets = np.array([[0, 0, 0], [np.linalg.norm(rest[15] - rest[0]), 0, 0]])
-        moved, status = fit_cage(column, make_handles(column.mesh, vertices=ids), np.asarray(targets))
+    rest = world_vertices(column.mesh)
+    length = np.linalg.norm(rest[15] - rest[0])
+    for ids, targets in (([0], [[5, 5, 5]]), ([0, 15], [[0, 0, 0], [length, 0, 0]])):
+        handles = make_handles(column.mesh, vertices=ids)
+        moved, status = fit_cage(column, handles, np.array(targets, float))
         assert status.converged and status.energy < 1e-8  # squared strains of 1e-4: rounding and the stop
-        np.testing.assert_allclose(world_vertices(moved.mesh)[ids], targets, atol=1e-5)
+        np.testing.assert_allclose(world_vertices(moved.mesh)[ids], targets, atol=1e-5)  # float32, size 5
 
 
 @pytest.mark.parametrize("soft", [None, 30.0])
 def test_the_result_is_a_minimum(x64, soft):
     """No small change of free vertices lowers the energy, which an SVD computes here."""
     impostor = impostor_of(COLUMN, "float64")
-    rest, tets, scale = world_vertices(impostor.mesh), np.asarray(impostor.mesh.tets), float(impostor.mesh.scale)
+    mesh = impostor.mesh
+    rest, tets, scale = world_vertices(mesh), np.asarray(mesh.tets), float(mesh.scale)
     ids = ends()
     targets = rest[ids] + np.where(rest[ids, 2:] > 1, [0.7, 0.0, 0.2], 0.0)
-    moved, status = fit_cage(impostor, make_handles(impostor.mesh, vertices=ids), targets, stiffness=soft)
+    moved, status = fit_cage(impostor, make_handles(mesh, vertices=ids), targets, stiffness=soft)
     found = world_vertices(moved.mesh)
 
     def objective(vertices):
         pull = 0.0 if soft is None else soft * np.sum((vertices[ids] - targets) ** 2) / scale**2
         return strain_energy(rest, tets, vertices) + pull
 
-    np.testing.assert_allclose(status.energy, strain_energy(rest, tets, found), rtol=1e-6)  # two formulas, float64
+    # Two formulas in float64; the frame's centre and scale round at 1e-16 of coordinates.
+    np.testing.assert_allclose(status.energy, strain_energy(rest, tets, found), rtol=1e-9)
     rng = np.random.default_rng(0)
     for _ in range(20):
         change = 1e-4 * rng.normal(size=rest.shape)
@@ -114,9 +116,10 @@ def test_gradients_match_finite_differences(x64):
     probe = jnp.asarray(np.random.default_rng(2).normal(size=rest.shape))
 
     for stiffness in (None, 20.0):
+
         def height(targets, rest_vertices, stiffness=stiffness):
             mesh = impostor.mesh.replace(vertices=rest_vertices)
-            moved, status = fit_cage(impostor.replace(mesh=mesh), handles, targets, stiffness=stiffness)
+            moved, _ = fit_cage(impostor.replace(mesh=mesh), handles, targets, stiffness=stiffness)
             return jnp.sum(probe * moved.mesh.vertices)
 
         arguments = targets, impostor.mesh.vertices
@@ -124,8 +127,10 @@ def test_gradients_match_finite_differences(x64):
         for which, gradient in enumerate(gradients):
             direction = jnp.asarray(np.random.default_rng(3).normal(size=gradient.shape))
             step = 1e-4
-            shifted = [[a + s * step * direction * (i == which) for i, a in enumerate(arguments)] for s in (1, -1)]
-            numeric = (height(*shifted[0]) - height(*shifted[1])) / (2 * step)
+            ends_of_step = [list(arguments), list(arguments)]
+            ends_of_step[0][which] += step * direction
+            ends_of_step[1][which] -= step * direction
+            numeric = (height(*ends_of_step[0]) - height(*ends_of_step[1])) / (2 * step)
             # Differences: 1e-8 of curvature, and what the solver leaves (1e-9) over the step.
             np.testing.assert_allclose(jnp.sum(gradient * direction), numeric, rtol=1e-4)
 
@@ -141,7 +146,8 @@ def test_soft_handles_become_exact(column):
     for stiffness in (1.0, 100.0, 10000.0):
         soft, status = fit_cage(column, handles, targets, stiffness=stiffness)
         errors.append(float(status.handle_error))
-    assert errors[0] > 0.02 and errors[1] < errors[0] / 20 and errors[2] < errors[1] / 20  # like 1 / stiffness
+    # Like 1 / stiffness.
+    assert errors[0] > 0.02 and errors[1] < errors[0] / 20 and errors[2] < errors[1] / 20
     # The miss at 10,000, and the solver's stop.
     np.testing.assert_allclose(world_vertices(soft.mesh), world_vertices(exact.mesh), atol=1e-3)
 
@@ -216,7 +222,8 @@ def test_under_jit_without_compiling_again(column):
 def test_too_few_steps_are_not_called_converged(column):
     handles = make_handles(column.mesh, vertices=ends())
     rest = world_vertices(column.mesh)[ends()]
-    moved, status = fit_cage(column, handles, rest + np.where(rest[:, 2:] > 1, [1.0, 1.0, 0.0], 0.0), max_steps=2)
+    targets = rest + np.where(rest[:, 2:] > 1, [1.0, 1.0, 0.0], 0.0)
+    _, status = fit_cage(column, handles, targets, max_steps=2)
     assert not status.converged and status.num_steps == 2 and status.residual > 1e-4
 
 
@@ -241,11 +248,11 @@ def test_errors_name_the_first(column):
     targets = np.zeros((2, 3))
     with pytest.raises(ValueError, match=r"targets must have shape \(2, 3\), got \(3, 3\)"):
         fit_cage(column, handles, np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="1 of 2 targets are not finite; first: target 1"):
+    with pytest.raises(ValueError, match="1 of 2 targets are not finite; first: number 1"):
         fit_cage(column, handles, np.array([[0, 0, 0], [0, np.inf, 0]]))
     with pytest.raises(ValueError, match="stiffness must be > 0"):
         fit_cage(column, handles, targets, stiffness=-1.0)
-    with pytest.raises(ValueError, match=r"start vertexs must have shape \(16, 3\)"):
+    with pytest.raises(ValueError, match=r"start must have shape \(16, 3\)"):
         fit_cage(column, handles, targets, start=targets)
 
 
@@ -255,12 +262,12 @@ def test_errors_name_the_first(column):
 def test_drag_moves_the_centre_and_nothing_outside():
     center, shift = np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.2, 0.0])
     move = drag(center, 1.0, shift, np.array([0.0, 0.0, np.pi / 2]))
-    points = jnp.asarray(np.stack([center, center + [1.0, 0, 0], center + [0, 5, 0], center + [0, 0, 0.5]]))
+    points = jnp.asarray(center + np.array([[0, 0, 0], [1.0, 0, 0], [0, 5, 0], [0, 0, 0.5]]))
     moved = np.asarray(move(points))
     np.testing.assert_allclose(moved[0], center + shift, atol=1e-6)  # float32
     np.testing.assert_array_equal(moved[1:3], points[1:3])
     # On the axis the rotation does nothing, and (1 - 1/4)^3 of the translation is left.
-    np.testing.assert_allclose(moved[3], center + [0, 0, 0.5] + 0.75**3 * shift, atol=1e-6)
+    np.testing.assert_allclose(moved[3], center + np.array([0, 0, 0.5]) + 0.75**3 * shift, atol=1e-6)
 
 
 def test_drag_turns_by_the_weight():

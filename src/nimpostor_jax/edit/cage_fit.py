@@ -30,8 +30,8 @@ from nimpostor_jax.geometry.polar import nearest_rotation
 from nimpostor_jax.geometry.tetrahedron import corners, cross, num_inverted
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
-# Levenberg-Marquardt starts with this share of the energy's diagonal added to it: small, because from the best
-# rigid motion a Gauss-Newton step is nearly always good.
+# Levenberg-Marquardt starts with this share of the energy's diagonal added to it. Of 1e-4, 1e-3 and 1e-2 the
+# last takes the fewest steps: Gauss-Newton underrates how stiff stretched tets are against rotation.
 INITIAL_DAMPING = 1e-2
 CG_STEPS = 60  # of an inner solve; where it stops early, it still goes downhill
 ADJOINT_CG_STEPS = 2000  # of the one solve behind a gradient, which nothing corrects afterwards
@@ -118,7 +118,7 @@ def make_handles(
         if outside.size:
             raise ValueError(
                 f"{outside.size} of {len(world)} handle points are not inside the cage; first: point "
-                f"{outside[0]} at {world[outside[0]].tolist()}; give points of the object at rest, or vertices"
+                f"{outside[0]} at {world[outside[0]].tolist()}; give points inside, at rest"
             )
         tet_ids, weights = np.concatenate([tet_ids, found]), np.concatenate([weights, located])
     if not len(vertex_ids) + len(tet_ids):
@@ -145,9 +145,11 @@ def _ids(values: ArrayLike, count: int, what: str) -> Int[np.ndarray, " N"]:
 
 
 def _coupling(
-    vertex_ids: Int[np.ndarray, " P"], point_corners: Int[np.ndarray, "Q 4"], weights: Float[np.ndarray, "Q 4"]
+    vertex_ids: Int[np.ndarray, " P"],
+    point_corners: Int[np.ndarray, "Q 4"],
+    weights: Float[np.ndarray, "Q 4"],
 ) -> Float[np.ndarray, "Q Q"]:
-    """Pseudo-inverse of B B^T, where column v of B holds what vertex v, unless it is a handle, does to points."""
+    """Pseudo-inverse of B B^T; B interpolates points from vertices, those that are handles left out."""
     free = np.where(np.isin(point_corners, vertex_ids), 0, weights)
     same = point_corners[:, None, :, None] == point_corners[None, :, None, :]
     gram = np.einsum("qi,rj,qrij->qr", free, free, same)
@@ -192,13 +194,16 @@ def fit_cage(
     """
     mesh = impostor.mesh
     dtype = mesh.vertices.dtype
-    _check(targets, (len(handles), 3), "target")
+    _check(targets, (len(handles), 3), "targets")
     if start is not None:
-        _check(start, mesh.vertices.shape, "start vertex")
+        _check(start, mesh.vertices.shape, "start")
     if stiffness is not None and not isinstance(stiffness, jax.core.Tracer) and not stiffness > 0:
         raise ValueError(f"stiffness must be > 0, or None for exact handles; got {stiffness}")
     local = (jnp.asarray(targets, dtype) - mesh.center) / mesh.scale
-    first = None if start is None else (jnp.asarray(start, dtype) - mesh.center) / mesh.scale
+    if start is None:
+        first = _best_rigid(mesh.vertices, _handle_points(handles, mesh.vertices), local)
+    else:
+        first = (jnp.asarray(start, dtype) - mesh.center) / mesh.scale
     vertices, status = _solve(
         mesh.vertices, mesh.tets, handles, local, stiffness, first, max_steps=max_steps
     )
@@ -208,12 +213,12 @@ def fit_cage(
 
 def _check(values: Any, shape: tuple[int, ...], what: str) -> None:
     if np.shape(values) != shape:
-        raise ValueError(f"{what}s must have shape {shape}, got {np.shape(values)}")
+        raise ValueError(f"{what} must have shape {shape}, got {np.shape(values)}")
     if not isinstance(values, jax.core.Tracer):
         bad = np.flatnonzero(~np.isfinite(np.asarray(values)).all(axis=1))
         if bad.size:
             raise ValueError(
-                f"{bad.size} of {shape[0]} {what}s are not finite; first: {what} {bad[0]} at "
+                f"{bad.size} of {shape[0]} {what} are not finite; first: number {bad[0]}, "
                 f"{np.asarray(values)[bad[0]].tolist()}"
             )
 
@@ -225,20 +230,19 @@ def _solve(
     handles: Handles,
     targets: Float[Array, "H 3"],
     stiffness: Scalar | None,
-    start: Float[Array, "V 3"] | None,
+    start: Float[Array, "V 3"],
     *,
     max_steps: int,
 ) -> tuple[Float[Array, "V 3"], CageFit]:
     """`fit_cage` on arrays in the mesh's frame."""
-    if start is None:
-        start = _best_rigid(rest, _handle_points(handles, rest), targets)
     problem = _problem(rest, tets, handles, targets, stiffness, jax.lax.stop_gradient(start))
     precise = rest.dtype == jnp.float64
     tolerance = 1e-11 if precise else 1e-5
     noise = float(jnp.finfo(rest.dtype).eps) / INITIAL_DAMPING  # of a force, whose diagonal is 1 / damping
-    inner = _Downhill(rtol=1e-3, atol=10 * noise, max_steps=CG_STEPS)
+    # Too short for rounding to add up, and a third less to compile than with residuals computed anew.
+    inner = _Downhill(rtol=1e-3, atol=10 * noise, stabilise_every=None, max_steps=CG_STEPS)
     adjoint = _Downhill(rtol=tolerance, atol=noise * (1e-2 if precise else 1), max_steps=ADJOINT_CG_STEPS)
-    solution = optx.least_squares(
+    solution: optx.Solution = optx.least_squares(
         _residuals,
         optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance, linear_solver=lx.Normal(inner)),
         jnp.zeros_like(rest),
@@ -352,6 +356,7 @@ def _handle_points(handles: Handles, vertices: Float[Array, "V 3"]) -> Float[Arr
     return jnp.concatenate([vertices[handles.vertex_ids], points])
 
 
+@jax.jit
 def _best_rigid(
     vertices: Float[Array, "V 3"], points: Float[Array, "H 3"], targets: Float[Array, "H 3"]
 ) -> Float[Array, "V 3"]:

@@ -168,8 +168,8 @@ def drag(
 
     Raises ValueError (outside jit) unless the radius is positive and all parameters are finite.
     """
-    given = {"radius": radius, "center": center, "translation": translation, "rotation_vector": rotation_vector}
-    for name, value in given.items():
+    vectors = {"center": center, "translation": translation, "rotation_vector": rotation_vector}
+    for name, value in {"radius": radius, **vectors}.items():
         if isinstance(value, jax.core.Tracer):
             continue
         shape = () if name == "radius" else (3,)
