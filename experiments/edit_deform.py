@@ -22,6 +22,7 @@ from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.edit.cage_fit import fit_cage, make_handles
 from nimpostor_jax.edit.deform import deform, deformation_report
 from nimpostor_jax.export.video import write_video
+from nimpostor_jax.geometry.topology import world_vertices
 from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.blender import PosedImages, load_blender, load_scene
 from nimpostor_jax.io.deformations import load_deformation
@@ -31,7 +32,6 @@ from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.pipeline.ray_bending import BentField
-from nimpostor_jax.preprocess.topology import world_vertices
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
 from nimpostor_jax.types import Camera, NeuralImpostor
 

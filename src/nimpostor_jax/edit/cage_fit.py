@@ -30,8 +30,8 @@ from nimpostor_jax.geometry.polar import nearest_rotation
 from nimpostor_jax.geometry.tetrahedron import corners, cross, num_inverted
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
-# Levenberg-Marquardt starts with this share of the energy's diagonal added to it. Of 1e-4, 1e-3 and 1e-2 the
-# last takes the fewest steps: Gauss-Newton underrates how stiff stretched tets are against rotation.
+# Of the energy's diagonal, added by Levenberg-Marquardt at first. Of 1e-4, 1e-3 and 1e-2 the last takes the
+# fewest steps: Gauss-Newton underrates how stiff stretched tets are against rotation.
 INITIAL_DAMPING = 1e-2
 CG_STEPS = 60  # of an inner solve; where it stops early, it still goes downhill
 ADJOINT_CG_STEPS = 2000  # of the one solve behind a gradient, which nothing corrects afterwards
@@ -204,9 +204,7 @@ def fit_cage(
         first = _best_rigid(mesh.vertices, _handle_points(handles, mesh.vertices), local)
     else:
         first = (jnp.asarray(start, dtype) - mesh.center) / mesh.scale
-    vertices, status = _solve(
-        mesh.vertices, mesh.tets, handles, local, stiffness, first, max_steps=max_steps
-    )
+    vertices, status = _solve(mesh.vertices, mesh.tets, handles, local, stiffness, first, max_steps=max_steps)
     status = status.replace(handle_error=status.handle_error * mesh.scale)
     return deform(impostor, lambda _: mesh.center + mesh.scale * vertices), status
 
@@ -248,19 +246,19 @@ def _solve(
         jnp.zeros_like(rest),
         args=problem,
         max_steps=max_steps,
-        adjoint=optx.ImplicitAdjoint(linear_solver=adjoint),
+        adjoint=_ForceAdjoint(linear_solver=adjoint),
         throw=False,
     )
     vertices = _positions(solution.value, problem)
-    residuals, pull_back = jax.vjp(lambda y: _residuals(y, problem), jax.lax.stop_gradient(solution.value))
-    force = pull_back(residuals)[0] * INITIAL_DAMPING
+    strain, _ = _residuals(jax.lax.stop_gradient(solution.value), problem)
+    force = _forces(jax.lax.stop_gradient(solution.value), problem) * INITIAL_DAMPING
     finite = jnp.all(jnp.isfinite(vertices))
     vertices = jnp.where(finite, vertices, rest)
     miss = _handle_points(handles, vertices) - targets
     return vertices, CageFit(
         converged=(solution.result == optx.RESULTS.successful) & finite,
         num_steps=solution.stats["num_steps"],
-        energy=jnp.sum(residuals[0] ** 2) / problem.gain**2,
+        energy=jnp.sum(strain**2) / problem.gain**2,
         residual=jnp.max(jnp.sqrt(jnp.sum((force * problem.widths) ** 2, axis=-1))),
         handle_error=jnp.sqrt(jnp.max(jnp.sum(miss**2, axis=-1))),
         num_inverted=num_inverted(vertices, tets),
@@ -275,7 +273,7 @@ class _Downhill(lx.CG):
     """
 
     def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]) -> Any:
-        """Tag the operator."""
+        """As of `lx.CG`, with the tag."""
         return super().init(lx.TaggedLinearOperator(operator, lx.positive_semidefinite_tag), options)
 
     def compute(self, state: Any, vector: Any, options: dict[str, Any]) -> tuple[Any, Any, dict[str, Any]]:
@@ -318,20 +316,49 @@ def _problem(
     return _Problem(tets, gradients, shares, handles, targets, stiffness, start, widths, gain)
 
 
-def _residuals(unknowns: Float[Array, "V 3"], problem: _Problem) -> tuple[Array, ...]:
-    """What least squares sums up: (F - R) of each tet, and with finite stiffness the handles' misses."""
+def _stretch_and_miss(unknowns: Float[Array, "V 3"], problem: _Problem) -> tuple[Array, Array]:
+    """What the energy measures: F of each tet, and how far soft handles are from their targets, scaled."""
     vertices = _positions(unknowns, problem)
     positions = corners(vertices, problem.tets)
     edges = positions[:, 1:] - positions[:, :1]
     # Elementwise: a float32 dot runs in reduced precision on accelerators.
     F = jnp.sum(edges[:, :, :, None] * problem.gradients[:, :, None, :], axis=1)
+    if problem.stiffness is None:
+        return F, jnp.zeros((0, 3), F.dtype)
+    miss = _handle_points(problem.handles, vertices) - problem.targets
+    return F, problem.gain * jnp.sqrt(problem.stiffness) * miss
+
+
+def _residuals(unknowns: Float[Array, "V 3"], problem: _Problem) -> list[Array]:
+    """What least squares sums up: (F - R) of each tet by the root of its share, and the handles' misses."""
+    F, miss = _stretch_and_miss(unknowns, problem)
     used = problem.volume_shares > 0
     root = jnp.where(used, jnp.sqrt(jnp.where(used, problem.volume_shares, 1)), 0)
-    strain = problem.gain * root[:, None, None] * (F - nearest_rotation(F))
-    if problem.stiffness is None:
-        return (strain,)
-    miss = _handle_points(problem.handles, vertices) - problem.targets
-    return strain, problem.gain * jnp.sqrt(problem.stiffness) * miss
+    return [problem.gain * root[:, None, None] * (F - nearest_rotation(F)), miss]
+
+
+def _forces(unknowns: Float[Array, "V 3"], problem: _Problem) -> Float[Array, "V 3"]:
+    """The gradient of half the sum of squares, zero at the minimum.
+
+    R drops out of it: a change of R is a rotation, to which F - R is orthogonal. So implicit differentiation
+    needs no second derivative of R, which eigenvectors do not give at rest, where all stretches are equal.
+    """
+    (F, miss), pull_back = jax.vjp(lambda y: _stretch_and_miss(y, problem), unknowns)
+    shares = problem.gain**2 * problem.volume_shares[:, None, None]
+    return pull_back((shares * (F - nearest_rotation(F)), miss))[0]
+
+
+def _optimality(unknowns: Float[Array, "V 3"], _: Any, inputs: tuple) -> Float[Array, "V 3"]:
+    """`_forces` as optimistix calls it."""
+    return _forces(unknowns, inputs[3])
+
+
+class _ForceAdjoint(optx.ImplicitAdjoint):
+    """Implicit differentiation of `_forces` = 0, which optimistix would derive from the residuals."""
+
+    def apply(self, primal_fn: Any, rewrite_fn: Any, inputs: Any, tags: Any) -> Any:
+        """Ours in the place of `rewrite_fn`."""
+        return super().apply(primal_fn, _optimality, inputs, tags)
 
 
 def _positions(unknowns: Float[Array, "V 3"], problem: _Problem) -> Float[Array, "V 3"]:
@@ -344,7 +371,7 @@ def _positions(unknowns: Float[Array, "V 3"], problem: _Problem) -> Float[Array,
     moved = moved.at[handles.vertex_ids].set(problem.targets[:count])
     miss = problem.targets[count:] - _handle_points(handles, moved)[count:]
     pull = jnp.sum(handles.point_inverse[:, :, None] * miss[None], axis=1)
-    # The nearest vertices that meet the points, without moving those that are handles themselves.
+    # To the nearest vertices that meet the points; those that are handles themselves stay.
     free = jnp.ones(len(moved), moved.dtype).at[handles.vertex_ids].set(0)
     weights = handles.point_weights * free[handles.point_corners]
     return moved.at[handles.point_corners].add(weights[:, :, None] * pull[:, None])
@@ -369,6 +396,5 @@ def _best_rigid(
     rotation = identity = jnp.eye(3, dtype=vertices.dtype)
     for _ in range(2):  # the second time it is drawn to the first one's answer: its error is squared
         rest = jnp.sum(covariance[:, None] * rotation[None], axis=-1) + TOWARDS_IDENTITY * size * identity
-        turn = nearest_rotation(rest)
-        rotation = jnp.sum(turn[:, :, None] * rotation[None], axis=1)
+        rotation = jnp.sum(nearest_rotation(rest)[:, :, None] * rotation[None], axis=1)
     return goal + jnp.sum(rotation[None] * (vertices - center)[:, None, :], axis=-1)
