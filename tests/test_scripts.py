@@ -100,7 +100,7 @@ def test_edit_deform_compares_with_true_pictures(tmp_path):
         (
             "edit_deform.py",
             ["--data=fluffy_ball", "--workdir=W", "--deformation=none.json"],
-            "experiments/train.py --workdir",
+            "experiments/train.py --data",
         ),
         ("bake.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
         ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage", "a.npz", "b.npz"], "2 cages for 1 scenes"),
