@@ -20,7 +20,7 @@ jax.config.update(
 )  # for the tests of data parallelism and of frames on several devices
 
 
-CORE = {"geometry", "encoding", "field", "render", "train"}
+CORE = {"geometry", "encoding", "field", "render", "train", "edit"}
 
 
 @pytest.fixture(autouse=True)

@@ -1,6 +1,7 @@
 """The scripts as a user runs them: the main job in small, and errors that end in one line."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -55,6 +56,38 @@ def test_train_evaluate_and_render(tmp_path):
     assert len(list((tmp_path / "orbit").glob("*.png"))) == 2
 
 
+def test_edit_deform_compares_with_true_pictures(tmp_path):
+    """The held-out views stand for pictures of an object that has hardly moved, and of one that has."""
+    builtin = ROOT / "src" / "nimpostor_jax" / "data" / "fluffy_ball"
+    data, work = tmp_path / "data", tmp_path / "work"
+    shutil.copytree(builtin, data)
+    shutil.copy(data / "transforms_test.json", data / "transforms_test_bend.json")
+    still, real = tmp_path / "deformation_bend.json", tmp_path / "deformation_far.json"
+    still.write_text('{"name": "bend", "c": 1e-3}')
+    real.write_text('{"name": "rigid", "rotation": [[1,0,0],[0,1,0],[0,0,1]], "translation": [0.5, 0, 0]}')
+    done = run("train.py", f"--data={data}", f"--workdir={work}", *SMALL)
+    assert done.returncode == 0, done.stderr
+    common = [f"--data={data}", f"--workdir={work}", "--quick", "--handles=6"]
+    done = run("edit_deform.py", *common, f"--deformation={still}")
+    assert done.returncode == 0, done.stderr
+    result = json.loads((work / "edit.json").read_text())
+    # Bent by 1e-3 rad a unit: less than a hundredth of a pixel.
+    assert result["psnr_deformed"] == pytest.approx(result["psnr_rest"], abs=0.1)
+    assert result["handles"]["converged"] and result["handles"]["rms_distance"] < 1e-3  # of what hardly moved
+    assert result["views"] == 2 and result["inverted_tets"] == 0 and result["split"] == "test_bend"
+    assert (work / "edit.gif").exists() and len(list((work / "edit").glob("*/*.png"))) == 6
+
+    split = ["--split=test_bend", f"--out={tmp_path / 'far'}"]
+    done = run("edit_deform.py", *common, f"--deformation={real}", *split)
+    assert done.returncode == 0, done.stderr
+    far = json.loads((tmp_path / "far" / "edit.json").read_text())
+    assert far["psnr_deformed"] < result["psnr_rest"] - 1  # it stands a quarter of the picture away
+    assert far["psnr_unmoved"] == pytest.approx(result["psnr_rest"], abs=1e-3)  # the same pictures
+
+    done = run("edit_deform.py", *common, f"--deformation={real}")
+    assert done.returncode == 2 and "no split 'test_far'" in done.stderr
+
+
 @pytest.mark.parametrize(
     "script, arguments, message",
     [
@@ -64,6 +97,11 @@ def test_train_evaluate_and_render(tmp_path):
         ("train.py", ["--data=fluffy_ball", "--workdir=W", "--max_minutes=-1"], "max_minutes"),
         ("train.py", ["--data=fluffy_ball", "--workdir=W", "--cage=none.npz"], "none.npz"),
         ("evaluate.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
+        (
+            "edit_deform.py",
+            ["--data=fluffy_ball", "--workdir=W", "--deformation=none.json"],
+            "experiments/train.py --data",
+        ),
         ("bake.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
         ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage", "a.npz", "b.npz"], "2 cages for 1 scenes"),
         ("make_cage.py", ["--surface=none.obj", "--out=W/c.npz"], "none.obj"),
@@ -78,10 +116,10 @@ def test_bad_input_ends_in_one_line(script, arguments, message, tmp_path):
     assert not workdir.exists()
 
 
-@pytest.mark.parametrize(
-    "script",
-    [f"{n}.py" for n in ("train", "evaluate", "render", "make_cage", "benchmark", "demo", "bake", "table2")],
-)
+SCRIPTS = ["train", "evaluate", "render", "make_cage", "benchmark", "demo", "bake", "edit_deform", "table2"]
+
+
+@pytest.mark.parametrize("script", [f"{name}.py" for name in SCRIPTS])
 def test_help_says_what_there_is(script):
     done = run(script, "--help")
     assert done.returncode == 0

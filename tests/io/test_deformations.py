@@ -34,6 +34,16 @@ def write(tmp_path, content):
             },
             deform.rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3])),
         ),
+        (
+            {
+                "name": "drag",
+                "center": [0.2, 0, 0.8],
+                "radius": 0.5,
+                "translation": [0.1, 0, 0],
+                "rotation_vector": [0, 0, 0.4],
+            },
+            deform.drag(np.array([0.2, 0, 0.8]), 0.5, np.array([0.1, 0, 0]), np.array([0, 0, 0.4])),
+        ),
     ],
 )
 def test_reads_every_family(tmp_path, content, same_as):
@@ -53,7 +63,7 @@ def test_reads_the_reference_scenes():
     [
         ("{", "not readable as JSON"),
         ("[1]", "expected an object"),
-        ({"c": 1.0}, "unknown deformation None; known: bend, rigid, stretch, twist"),
+        ({"c": 1.0}, "unknown deformation None; known: bend, drag, rigid, stretch, twist"),
         ({"name": "fold"}, "unknown deformation 'fold'; known: bend"),
         ({"name": ["bend"]}, "unknown deformation"),
         ({"name": "stretch", "a": 1.0}, "'stretch' lacks parameter 'b'; it takes a, b"),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
+from nimpostor_jax.geometry.tetrahedron import corners, cross, signed_volumes
 from nimpostor_jax.types import NeuralImpostor
 
 SpaceMap = Callable[[Float[Array, "V 3"]], Float[Array, "V 3"]]
@@ -154,9 +154,56 @@ def rigid(rotation: Float[Array, "3 3"], translation: Float[Array, " 3"]) -> Spa
     return space_map
 
 
+def drag(
+    center: Float[Array, " 3"],
+    radius: Scalar,
+    translation: Float[Array, " 3"],
+    rotation_vector: Float[Array, " 3"],
+) -> SpaceMap:
+    """A handle with falloff: a ball turned about its centre and moved, less and less towards its surface.
+
+    With w = (1 - |x - center|^2 / radius^2)^3 inside and 0 outside (C^2, compact), x moves to
+    center + R(w * rotation_vector) (x - center) + w * translation; `rotation_vector` is the axis times the
+    angle in radians. A translation folds space when it is longer than 0.58 radius (1 / max |dw/dr|).
+
+    Raises ValueError (outside jit) unless the radius is positive and all parameters are finite.
+    """
+    vectors = {"center": center, "translation": translation, "rotation_vector": rotation_vector}
+    for name, value in {"radius": radius, **vectors}.items():
+        if isinstance(value, jax.core.Tracer):
+            continue
+        shape = () if name == "radius" else (3,)
+        if np.shape(value) != shape or not np.isfinite(np.asarray(value)).all():
+            raise ValueError(f"drag: {name} must be finite, of shape {shape}; got {value!r}")
+        if name == "radius" and not value > 0:
+            raise ValueError(f"drag: radius must be > 0, got {value}")
+
+    def space_map(points: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
+        middle, shift, turn = (jnp.asarray(x, points.dtype) for x in (center, translation, rotation_vector))
+        offset = points - middle
+        weight = (jnp.maximum(1 - jnp.sum(offset**2, axis=-1, keepdims=True) / radius**2, 0)) ** 3
+        # The exact identity outside, where (x - center) + center would round.
+        moved = middle + _rotated(offset, weight * turn) + weight * shift
+        return jnp.where(weight > 0, moved, points)
+
+    return space_map
+
+
+def _rotated(vectors: Float[Array, "V 3"], turns: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
+    """Rodrigues' formula for a rotation vector each; differentiable where it is zero, too."""
+    squared = jnp.sum(turns**2, axis=-1, keepdims=True)
+    small = squared < 1e-8  # the series' next term is below the square of this: no digit, in float32
+    angle = jnp.sqrt(jnp.where(small, 1, squared))
+    sine = jnp.where(small, 1 - squared / 6, jnp.sin(angle) / angle)
+    versine = jnp.where(small, 0.5 - squared / 24, 2 * (jnp.sin(angle / 2) / angle) ** 2)
+    once = cross(turns, vectors)
+    return vectors + sine * once + versine * cross(turns, once)
+
+
 FAMILIES: dict[str, Callable[..., SpaceMap]] = {
     "twist": twist,
     "bend": bend,
     "stretch": stretch,
     "rigid": rigid,
+    "drag": drag,
 }

@@ -12,6 +12,8 @@ from nimpostor_jax.edit.deform import FAMILIES, SpaceMap
 _SHAPES: dict[str, tuple[int, ...]] = {
     "rotation": (3, 3),
     "translation": (3,),
+    "center": (3,),
+    "rotation_vector": (3,),
 }  # all others: numbers
 
 
