@@ -17,7 +17,7 @@ from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.blender import PosedImages
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.lpips import MIN_SIDE as LPIPS_MIN_SIDE
-from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import Frame, frame_config, render_frame, to_image
 from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor
 
 Log = Callable[[str], None]
@@ -39,7 +39,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """PSNR, SSIM and LPIPS (None without the extra `lpips`) on views, mean and per view; seconds a frame.
 
-    With `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The time is the median
+    Truth and render stand over the view's own background where it has one, else over `background`. With
+    `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The time is the median
     over the views of a whole frame, with everything but compilation.
     """
     per_view: list[dict[str, Any]] = []
@@ -50,8 +51,9 @@ def evaluate(
         start = time.perf_counter()
         frame = render_frame(impostor, camera_of(views, index), sized)
         seconds.append(time.perf_counter() - start)
-        image = to_image(frame, 1.0 if background == "white" else 0.0)
-        truth = composite(views.images[index], background)
+        behind = views.background(index, background)
+        image = composite_frame(frame, behind)
+        truth = composite(views.images[index], behind)
         per_view.append(
             {
                 "view": name,
@@ -78,6 +80,15 @@ def evaluate(
         f"{result['seconds_per_frame']:.2f} s a frame"
     )
     return result
+
+
+def composite_frame(
+    frame: Frame, background: str | Float[np.ndarray, "H W 3"]
+) -> Float[np.ndarray, "H W 3"]:
+    """A frame over "white", "black" or a picture, clipped to [0, 1]."""
+    if isinstance(background, str):
+        return to_image(frame, 1.0 if background == "white" else 0.0)
+    return to_image(frame, background)
 
 
 def _mean(values: list[float | None]) -> float | None:
