@@ -49,6 +49,7 @@ _MIN_LIGHT = 0.1  # of a ray's light that a voxel takes in at least ...
 _MIN_VIEWS = 3  # ... so many views, to be the object's
 _MIN_PART = 0.05  # of the main component's voxels: smaller ones are floaters
 _RAYS = 4096  # at once
+_MAX_RAYS = 600_000  # that look for voxels
 _NEAR_WALL = 1.5  # voxels
 _VOXEL_PIXELS = 0.75  # across the finest voxel
 
@@ -176,13 +177,13 @@ def _lit_voxels(
     size = float((bounds[1] - bounds[0]).max()) / resolution
     shape = np.maximum(np.ceil((bounds[1] - bounds[0]) / size - 1e-9).astype(int), 1)
     origin = bounds.mean(axis=0) - 0.5 * size * (shape - 1)
-    pool, count = scene.pool, len(scene.pool.views)
+    pool = scene.pool
     needed = min(_MIN_VIEWS, max(1, len(scene.train) // 4))
     # In random order, so that chunks need buffers like training's batches.
-    order = np.random.default_rng(0).permutation(count)
+    order = np.random.default_rng(0).permutation(_pixels_towards(scene, bounds))[:_MAX_RAYS]
     pairs = []
-    for start in range(0, count, _RAYS):
-        chosen = np.resize(order[start : start + _RAYS], min(_RAYS, count))
+    for start in range(0, len(order), _RAYS):
+        chosen = np.resize(order[start : start + _RAYS], _RAYS)
         found = _light(impostor, pool, chosen, scene.render)
         owners, points, light = (np.asarray(x) for x in found)
         index = np.floor((points - origin) / size + 0.5).astype(np.int64)
@@ -196,6 +197,21 @@ def _lit_voxels(
     seen = np.unique(np.concatenate(pairs)) % shape.prod()
     votes = np.bincount(seen, minlength=shape.prod()).reshape(shape)
     return OccupancyGrid(votes >= needed, origin, size)
+
+
+def _pixels_towards(scene: Scene, bounds: Float[np.ndarray, "2 3"]) -> Int[np.ndarray, " P"]:
+    """Which of the pool's pixels look through a box."""
+    box, train = Region(*bounds), scene.train
+    pixels, views = np.asarray(scene.pool.pixels), np.asarray(scene.pool.views)
+    found = []
+    for view in range(len(train)):
+        chosen = np.flatnonzero(views == view)
+        pose, x, y = train.camera_to_world[view], *pixels[chosen].T
+        directions = pixel_directions(
+            pose, train.focal[view], train.principal[view], train.width, train.height
+        )
+        found.append(chosen[~box.is_missed(pose[:3, 3], directions[y, x])])
+    return np.concatenate(found)
 
 
 @partial(jax.jit, static_argnames="config")

@@ -119,7 +119,8 @@ def orbit(
 ) -> list[Camera]:
     """Cameras on a circle around the vertical axis, looking at the centre of what the views look at.
 
-    The radius is the views' median distance, the lens the first view's.
+    Vertical is what the views' cameras take for it: captured scenes may have any axis up. The radius is the
+    views' median distance, the lens the first view's.
     """
     positions = views.camera_to_world[:, :3, 3]
     forward = -views.camera_to_world[:, :3, 2]
@@ -127,6 +128,11 @@ def orbit(
     projectors = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     center = np.linalg.lstsq(projectors.sum(0), np.einsum("nij,nj->i", projectors, positions), rcond=None)[0]
     radius = np.median(np.linalg.norm(positions - center, axis=1))
+    up = vertical(views)
+    across = np.eye(3)[np.argmin(np.abs(up) > 0.9)]  # x, unless that is near the vertical
+    across -= (across @ up) * up
+    across /= np.linalg.norm(across)
+    frame = np.stack([across, np.cross(up, across), up], axis=1)
     size = size or views.width
     zoom = size / views.width
     height = round(views.height * zoom)
@@ -142,6 +148,7 @@ def orbit(
         )
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         pose = np.eye(4)
+        back, right = frame @ back, frame @ right
         pose[:3] = np.stack([right, np.cross(back, right), back, center + radius * back], axis=1)
         cameras.append(
             Camera(
@@ -153,3 +160,19 @@ def orbit(
             )
         )
     return cameras
+
+
+def vertical(views: PosedImages) -> Float[np.ndarray, " 3"]:
+    """The unit direction that is up in most pictures.
+
+    Where cameras are held level, that at right angles to all their horizontal axes; else their mean up.
+    """
+    right, upward = views.camera_to_world[:, :3, 0], views.camera_to_world[:, :3, 1].mean(axis=0)
+    spread, axes = np.linalg.eigh(right.T @ right / len(right))
+    if spread[0] < _LEVEL < spread[1]:
+        return axes[:, 0] if axes[:, 0] @ upward >= 0 else -axes[:, 0]
+    length = np.linalg.norm(upward)
+    return upward / length if length > _LEVEL else np.array([0.0, 0.0, 1.0])
+
+
+_LEVEL = 0.02  # mean square of a horizontal axis' vertical part: hand-held cameras are tilted by degrees
