@@ -1,9 +1,14 @@
 """Captures that tests make: an object in front of a smooth dome, through a lens, in a world of any frame.
 
-The lens is written out here (OpenCV's model), so that it checks the one that the library uses.
+    python tests/captures.py --data=DIR --out=DIR [--resolution=200] [--poses={json,colmap,none}]
+
+turns the training views of an RGBA scene into such photographs. The lens is written out here (OpenCV's
+model), so that it checks the one that the library uses.
 """
 
+import argparse
 import json
+from pathlib import Path
 
 import numpy as np
 from PIL import Image
@@ -90,3 +95,42 @@ def write_capture(folder, views, world=None, lens=LENS, wide=0.95, background=do
     meta |= {"w": width, "h": height, **lens, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(meta))
     return folder
+
+
+def to_colmap_model(folder):
+    """Put a COLMAP model with the same poses and lens in the place of a capture's `transforms.json`."""
+    import pycolmap
+
+    meta = json.loads((folder / "transforms.json").read_text())
+    params = [meta[key] for key in ("fl_x", "fl_y", "cx", "cy")] + [meta.get(k, 0.0) for k in LENS]
+    camera = pycolmap.Camera(camera_id=1, model="OPENCV", width=meta["w"], height=meta["h"], params=params)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    for i, frame in enumerate(meta["frames"]):
+        world_to_camera = np.diag([1, -1, -1, 1]) @ np.linalg.inv(frame["transform_matrix"])
+        image = pycolmap.Image(name=Path(frame["file_path"]).name, camera_id=1, image_id=i + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world_to_camera[:3]))
+    (folder / "sparse" / "0").mkdir(parents=True)
+    model.write_binary(folder / "sparse" / "0")
+    (folder / "transforms.json").unlink()
+
+
+def main():
+    """Run as a script."""
+    from nimpostor_jax.io.blender import load_blender
+
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", required=True)
+    parser.add_argument("--out", required=True, type=Path)
+    parser.add_argument("--resolution", type=int)
+    parser.add_argument("--poses", choices=["json", "colmap", "none"], default="json")
+    args = parser.parse_args()
+    write_capture(args.out, load_blender(args.data, "train", args.resolution))
+    if args.poses == "colmap":
+        to_colmap_model(args.out)
+    elif args.poses == "none":
+        (args.out / "transforms.json").unlink()
+
+
+if __name__ == "__main__":
+    main()

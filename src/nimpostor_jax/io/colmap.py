@@ -6,7 +6,6 @@ Pixel centres lie at half integers in both.
 """
 
 import dataclasses
-import importlib
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -60,12 +59,13 @@ class ModelImage:
 def require_pycolmap(purpose: str) -> Any:
     """The module pycolmap; ValueError that names the extra where it is missing."""
     try:
-        return importlib.import_module("pycolmap")
+        import pycolmap
     except ImportError as error:
         raise ValueError(
             f"{purpose} needs pycolmap, which is not installed ({error}); "
             "pip install 'nimpostor-jax[capture]'"
         ) from error
+    return pycolmap
 
 
 def find_model(folder: Path) -> Path | None:
