@@ -10,10 +10,12 @@ from captures import LENS, distort, undistort
 from numpy.testing import assert_allclose
 from PIL import Image
 from scene_files import camera_to_world
+from scipy import ndimage
 
 from nimpostor_jax.io.blender import load_blender
 from nimpostor_jax.io.capture import common_crops, read_capture, write_views
 from nimpostor_jax.io.colmap import Lens, require_pycolmap
+from nimpostor_jax.preprocess.surroundings import pixel_directions
 
 WIDTH, HEIGHT = 120, 90
 INTRINSICS = {"fl_x": 130.0, "fl_y": 128.0, "cx": 63.0, "cy": 42.0, "w": WIDTH, "h": HEIGHT}
@@ -250,3 +252,52 @@ def test_an_image_with_a_mask_is_refused(tmp_path, plain):
     folder = write_folder(tmp_path / "data", [plain[0], masked, plain[2]], INTRINSICS)
     with pytest.raises(ValueError, match=r"p1\.png has an alpha mask.*train\.py"):
         undistorted_views(folder, tmp_path)
+
+
+# Images alone
+
+
+def textured_ball(pose, focal, side, lattice):
+    """A ball of radius 1 with random texture before grey, uint8 RGB."""
+    directions = pixel_directions(pose, np.full(2, focal), np.full(2, 0.5 * side), side, side)
+    along = -directions @ pose[:3, 3]
+    gap = pose[:3, 3] @ pose[:3, 3] - along**2
+    points = pose[:3, 3] + (along - np.sqrt(np.maximum(1 - gap, 0)))[..., None] * directions
+    grey = np.zeros((side, side))
+    for scale, weight in ((6, 0.6), (14, 0.4)):
+        at = np.moveaxis(scale * points, -1, 0)
+        grey += weight * ndimage.map_coordinates(lattice, at, order=1, mode="grid-wrap")
+    grey = np.where(gap < 1, grey, 0.5)
+    return np.repeat(np.rint(255 * grey).astype(np.uint8)[..., None], 3, axis=-1)
+
+
+@pytest.mark.slow
+@needs_pycolmap
+def test_poses_from_images_alone(tmp_path):
+    """COLMAP's cameras stand where ours did, up to its choice of world."""
+    rng, side, focal = np.random.default_rng(0), 300, 400.0
+    lattice = rng.uniform(size=(32, 32, 32))
+    angles = np.arange(36) * np.pi / 18
+    elevation = 0.35 * np.sin(3 * angles)
+    right = np.stack([-np.sin(angles), np.cos(angles), 0 * angles], 1)
+    level = np.cross(right, [0, 0, 1])
+    back = np.cos(elevation)[:, None] * level + np.sin(elevation)[:, None] * [0, 0, 1]
+    poses = np.tile(np.eye(4), (36, 1, 1))
+    poses[:, :3] = np.stack([right, np.cross(back, right), back, 3.2 * back], axis=2)
+    (tmp_path / "data" / "images").mkdir(parents=True)
+    for i, pose in enumerate(poses):
+        pixels = textured_ball(pose, focal, side, lattice)
+        Image.fromarray(pixels).save(tmp_path / "data" / "images" / f"{i:02d}.png")
+    capture = read_capture(tmp_path / "data", tmp_path / "work", log=lambda _: None)
+    assert len(capture.paths) == 36
+    found, true = capture.camera_to_world[:, :3, 3], poses[:, :3, 3]
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    u, s, vt = np.linalg.svd(b.T @ a)
+    rotation = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    scale = (s * [1, 1, np.sign(np.linalg.det(u @ vt))]).sum() / np.sum(a**2)
+    # Features are a few tenths of a pixel off: 0.1 % of the distance; a lens is estimated too.
+    assert np.abs(scale * a @ rotation.T - b).max() < 0.03 * 3.2
+    turned = rotation @ capture.camera_to_world[:, :3, :3]
+    assert_allclose(turned, poses[:, :3, :3], atol=0.05)
+    again = read_capture(tmp_path / "data", tmp_path / "work", log=lambda _: None)
+    assert_allclose(again.camera_to_world, capture.camera_to_world)
