@@ -17,7 +17,7 @@ from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import load_baked, load_impostor, save_impostor
 from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.bake import bake
-from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, evaluate, write_json
 from nimpostor_jax.pipeline.fit import fit
 from nimpostor_jax.pipeline.prepare import Scene, prepare
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
@@ -84,8 +84,10 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
 
     def measure(impostor: NeuralImpostor, step: int) -> None:
         sized = frame_config(impostor, camera_of(views, 0), config.render)
-        images = [to_image(render_frame(impostor, camera_of(views, i), sized)) for i in range(len(views))]
-        truths = [composite(truth, "white") for truth in views.images]
+        frames = [render_frame(impostor, camera_of(views, i), sized) for i in range(len(views))]
+        behind = [views.background(i, "white") for i in range(len(views))]
+        images = [composite_frame(*pair) for pair in zip(frames, behind, strict=True)]
+        truths = [composite(*pair) for pair in zip(views.images, behind, strict=True)]
         curve[:] = [point for point in curve if point[0] < step]
         curve.append((step, float(np.mean([psnr(*pair) for pair in zip(images, truths, strict=True)]))))
         write_json(curve_file, curve)
@@ -167,10 +169,11 @@ def seconds_to(curve: Sequence[tuple[float, float]], target: float) -> float | N
 def write_picture(path: Path, trained: Sequence[Trained]) -> None:
     """The first held-out view: truth, then every method."""
     views = trained[0].scene.test
-    camera, images = camera_of(views, 0), [composite(views.images[0], "white")]
+    camera, behind = camera_of(views, 0), views.background(0, "white")
+    images = [composite(views.images[0], behind)]
     for each in trained:
         sized = frame_config(each.impostor, camera, each.scene.config.render)
-        images.append(to_image(render_frame(each.impostor, camera, sized)))
+        images.append(composite_frame(render_frame(each.impostor, camera, sized), behind))
     write_png(path, np.concatenate(images, axis=1))
 
 

@@ -10,6 +10,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.gin_flags import add_flags, config_from_args, operative_config_text, run_cli
 from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.impostor_file import save_impostor
@@ -36,23 +37,30 @@ def main(argv: Sequence[str]) -> None:
     config = config_from_args(args)
 
     use_all_cores()
-    own_cage = args.workdir / "cage.npz"
-    cage = args.cage or (own_cage if own_cage.exists() else None)
-    scene = prepare(config, args.data, cage=cage, cage_output=own_cage)
-    with atomic_path(args.workdir / "config.gin") as path:
+    train(config, args.data, args.workdir, args.cage, args.max_minutes)
+
+
+def train(
+    config: ExperimentConfig, data: str | Path, workdir: Path, cage: Path | None, max_minutes: float | None
+) -> None:
+    """Prepare, train, evaluate and save a run."""
+    own_cage = workdir / "cage.npz"
+    cage = cage or (own_cage if own_cage.exists() else None)
+    scene = prepare(config, data, cage=cage, cage_output=own_cage)
+    with atomic_path(workdir / "config.gin") as path:
         path.write_text(operative_config_text(config), encoding="utf-8")
-    impostor, progress = fit(scene, workdir=args.workdir, max_minutes=args.max_minutes)
+    impostor, progress = fit(scene, workdir=workdir, max_minutes=max_minutes)
     print(f"trained {progress.step} steps in {progress.seconds / 60:.1f} minutes")
-    save_impostor(args.workdir / "impostor.npz", impostor)
+    save_impostor(workdir / "impostor.npz", impostor)
     result = evaluate(
         impostor,
         scene.test,
         config.render,
         background=config.data.background,
-        pictures=args.workdir / "pictures",
+        pictures=workdir / "pictures",
     )
     result |= {"steps": progress.step, "train_seconds": progress.seconds}
-    write_json(args.workdir / "metrics.json", result)
+    write_json(workdir / "metrics.json", result)
 
 
 if __name__ == "__main__":

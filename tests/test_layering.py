@@ -27,6 +27,7 @@ CONFINED = {
     "pyvista": ["preprocess/"],
     "meshio": ["io/mesh_files.py"],
     "orbax": ["io/checkpoint.py"],
+    "pycolmap": ["io/colmap.py"],
     "gin": ["gin_flags.py"],
     "optimistix": ["edit/", "simulate/"],
     "lineax": ["edit/", "simulate/"],

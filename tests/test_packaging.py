@@ -58,7 +58,7 @@ def distributions(folder: Path) -> dict[str, str]:
 
 
 def test_every_import_of_the_package_is_declared():
-    optional = EXTRAS["lpips"]
+    optional = EXTRAS["lpips"] | EXTRAS["capture"]
     assert {k: v for k, v in distributions(PACKAGE).items() if k not in CORE | optional} == {}
 
 

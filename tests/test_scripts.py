@@ -1,12 +1,20 @@
 """The scripts as a user runs them: the main job in small, and errors that end in one line."""
 
+import importlib.util
 import json
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import captures
+import numpy as np
 import pytest
+
+from nimpostor_jax.io.blender import load_blender
+from nimpostor_jax.io.mesh_files import load_tets
+from nimpostor_jax.io.scenes import builtin_scene
+from nimpostor_jax.preprocess.validate import missed_foreground
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = [
@@ -105,6 +113,9 @@ def test_edit_deform_compares_with_true_pictures(tmp_path):
         ("bake.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
         ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage", "a.npz", "b.npz"], "2 cages for 1 scenes"),
         ("make_cage.py", ["--surface=none.obj", "--out=W/c.npz"], "none.obj"),
+        ("capture.py", ["--data=nowhere", "--workdir=W"], "nowhere"),
+        ("capture.py", ["--data=nowhere", "--workdir=W", "--coarse_bindings=TrainConfig.stepz=1"], "steps"),
+        ("capture.py", ["--data=.", "--workdir=W", "--box", "0", "0", "0", "1", "1", "0"], "--box"),
     ],
 )
 def test_bad_input_ends_in_one_line(script, arguments, message, tmp_path):
@@ -116,7 +127,10 @@ def test_bad_input_ends_in_one_line(script, arguments, message, tmp_path):
     assert not workdir.exists()
 
 
-SCRIPTS = ["train", "evaluate", "render", "make_cage", "benchmark", "demo", "bake", "edit_deform", "table2"]
+SCRIPTS = [
+    "train", "evaluate", "render", "make_cage", "benchmark", "demo", "bake", "table2", "capture",
+    "edit_deform", "edit_remesh", "edit_boolean", "edit_compose",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("script", [f"{name}.py" for name in SCRIPTS])
@@ -155,3 +169,33 @@ def test_the_tables_come_out_of_scripts(tmp_path):
     rows = json.loads((tmp_path / "figure10.json").read_text())["rows"]
     assert rows[0]["tets"] == 6
     assert rows[1]["tets"] == pytest.approx(436, rel=0.2)
+
+
+@pytest.mark.slow
+def test_photographs_become_an_impostor(tmp_path):
+    """Poses, a lens and no masks: the dataset, a cage around the object, and a matte that is the object's."""
+    if importlib.util.find_spec("pycolmap") is None:
+        pytest.skip("pycolmap (extra capture) is not installed")
+    views = load_blender(builtin_scene("fluffy_ball"), "train", 64)
+    world = captures.similarity(scale=0.02)
+    captures.write_capture(tmp_path / "data", views, world)
+    small = [*SMALL, "DataConfig.resolution=None", "TrainConfig.steps=100"]
+    coarse = ["--coarse_bindings", "DataConfig.resolution=64", "TrainConfig.steps=120"]
+    out = tmp_path / "work"
+    done = run("capture.py", f"--data={tmp_path / 'data'}", f"--workdir={out}", *small, *coarse, timeout=1500)
+    assert done.returncode == 0, done.stderr
+    for name in ("scene/transforms_train.json", "cage.npz", "impostor.npz", "metrics.json"):
+        assert (out / name).exists(), name
+    vertices, tets = load_tets(out / "cage.npz")
+    poses = captures.moved(views.camera_to_world, *world)
+    solid = (views.masks > 0.9).astype(np.float32)
+    missed = missed_foreground(vertices, tets, solid, poses, views.focal, views.principal)
+    assert missed.missed_share < 0.01
+    size = np.ptp(vertices, axis=0) / world[1]
+    assert size.min() > 1.5 and size.max() < 3.5  # the ball with its fur is about 2 units wide
+    psnr = json.loads((out / "metrics.json").read_text())["psnr"]
+    assert psnr > 20  # 100 steps; the background alone gives less than 15 dB
+
+    done = run("evaluate.py", f"--data={out / 'scene'}", f"--workdir={out}")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((out / "metrics.json").read_text())["psnr"] == pytest.approx(psnr, abs=0.01)

@@ -229,7 +229,7 @@ def test_camera_rounded_to_four_digits_is_rigid(make_scene, rgba):
         ("fl_x", -1.0, "must be positive"),
         ("fl_x", "wide", "'fl_x' must be a finite number"),
         ("camera_angle_x", 3.5, r"in \(0, pi\)"),
-        ("k1", 0.1, "'k1' is not supported; undistort"),
+        ("k1", 0.1, "'k1' is not supported here; undistort"),
         ("w", 0, "must be positive"),
         ("w", 8, "say 8x4, the images are 4x4"),
     ],
@@ -256,6 +256,51 @@ def test_missing_angle(make_scene, rgba):
 def test_resolution_beyond_the_stored(make_scene, rgba, resolution):
     with pytest.raises(ValueError, match=rf"resolution {resolution} .*stored width of .*r_0\.png"):
         load_blender(make_scene([rgba(6, 8)]), "train", resolution)
+
+
+# Backgrounds
+
+
+def add_backgrounds(folder, pictures, frames=None):
+    meta = read_transforms(folder)
+    for i, pixels in enumerate(pictures):
+        Image.fromarray(pixels).save(folder / f"b{i}.png")
+        if frames is None or i in frames:
+            meta["frames"][i]["background_path"] = f"b{i}.png"
+    write_transforms(folder, "train", meta)
+    return folder
+
+
+def test_backgrounds_come_along_at_the_same_size(make_scene, rgba):
+    behind = [rgba(6, 8)[..., :3] for _ in range(2)]
+    folder = add_backgrounds(make_scene([rgba(6, 8)[..., :3] for _ in range(2)]), behind)
+    posed = load_blender(folder, "train")
+    assert_allclose(posed.backgrounds, np.stack(behind) / 255, atol=ROUNDING)
+    small = load_blender(folder, "train", 4)
+    for i in range(2):
+        assert_allclose(small.backgrounds[i], area_downsample(posed.backgrounds[i], 4, 3), atol=ROUNDING)
+    assert_array_equal(posed.select([1]).backgrounds, posed.backgrounds[1:])
+    assert_array_equal(posed.background(1, "white"), posed.backgrounds[1])
+    assert load_blender(make_scene([rgba(4, 4)]), "train").background(0, "white") == "white"
+
+
+def test_a_background_of_some_frames_only(make_scene, rgba):
+    folder = add_backgrounds(make_scene([rgba(4, 4)] * 2), [rgba(4, 4)[..., :3]] * 2, frames=[0])
+    with pytest.raises(ValueError, match="frame 1 has no 'background_path' but others have"):
+        load_blender(folder, "train")
+
+
+def test_a_background_of_another_size(make_scene, rgba):
+    folder = add_backgrounds(make_scene([rgba(4, 4)]), [rgba(4, 5)[..., :3]])
+    with pytest.raises(ValueError, match=r"background .*b0\.png is 5x4 but the images are 4x4"):
+        load_blender(folder, "train")
+
+
+def test_a_missing_background(make_scene, rgba):
+    folder = add_backgrounds(make_scene([rgba(4, 4)]), [rgba(4, 4)[..., :3]])
+    (folder / "b0.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"b0\.png does not exist .*frame 0"):
+        load_blender(folder, "train")
 
 
 # Masks

@@ -1,6 +1,7 @@
 """The training run: it learns, it logs, and a killed run ends like one that was not."""
 
 import csv
+import dataclasses
 
 import jax
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 from nimpostor_jax.gin_flags import load_config
 from nimpostor_jax.io.mesh_files import save_tets
-from nimpostor_jax.pipeline.evaluate import evaluate, orbit
+from nimpostor_jax.pipeline.evaluate import evaluate, orbit, vertical
 from nimpostor_jax.pipeline.fit import Progress, fit
 from nimpostor_jax.pipeline.prepare import prepare
 
@@ -82,6 +83,35 @@ def test_checkpoint_of_another_configuration_is_refused(scene, bindings, cage, t
     other = load_config(bindings=[*bindings, "EncodingConfig.num_levels=2"])
     with pytest.raises(ValueError, match="num_levels"):
         fit(prepare(other, "fluffy_ball", cage=cage, log=lambda _: None), workdir=tmp_path)
+
+
+def test_views_are_compared_over_their_own_backgrounds(scene):
+    """A field that shows nothing is right where the truth is the background, and off by the rest."""
+    views = scene.test.select([0])
+    behind = np.random.default_rng(0).uniform(size=views.images[..., :3].shape).astype(np.float32)
+    opaque = np.concatenate([behind, np.ones_like(behind[..., :1])], axis=-1)
+    opaque[0, :5, :, :3] = 1 - behind[0, :5]
+    decoders = jax.tree.map(np.zeros_like, scene.impostor.decoders)
+    decoders["density"][-1]["bias"] = decoders["density"][-1]["bias"] - 40.0  # exp(-40): clear
+    clear = dataclasses.replace(scene.impostor, decoders=decoders)
+    views = dataclasses.replace(views, images=opaque, backgrounds=behind)
+    found = evaluate(clear, views, scene.config.render, log=lambda _: None)["psnr"]
+    wrong = np.mean(np.square(opaque[..., :3] - behind))
+    assert found == pytest.approx(-10 * np.log10(wrong), abs=1e-3)
+
+
+def test_the_vertical_is_the_cameras_own(scene):
+    views = scene.train  # held level, in a world with z up
+    np.testing.assert_allclose(vertical(views), [0, 0, 1], atol=1e-6)
+    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    poses = views.camera_to_world.copy()
+    poses[:, :3] = turn @ poses[:, :3]
+    turned = dataclasses.replace(views, camera_to_world=poses)
+    np.testing.assert_allclose(vertical(turned), turn @ [0, 0, 1], atol=1e-6)
+    for one, other in zip(orbit(views, 3), orbit(turned, 3), strict=True):
+        height = np.asarray(one.camera_to_world)[2, 3]
+        turned_height = turn[:, 2] @ np.asarray(other.camera_to_world)[:3, 3]
+        np.testing.assert_allclose(turned_height, height, atol=1e-5)  # float32
 
 
 def test_orbit_looks_at_the_object(scene):

@@ -14,7 +14,7 @@ from scenes import RENDER
 from nimpostor_jax.render.camera import pixel_rays
 from nimpostor_jax.render.capacity import ray_entries
 from nimpostor_jax.render.traverse import march_tables
-from nimpostor_jax.train.pool import build_pool, draw_batch
+from nimpostor_jax.train.pool import OPACITY_COST, build_pool, draw_batch
 
 WIDTH, HEIGHT = 14, 10
 
@@ -104,6 +104,20 @@ def test_plain_backgrounds(pool, background, value):
     assert_array_equal(
         draw_batch(jax.random.key(0), 0, pool[0], 8, background).background, np.full((8, 3), value)
     )
+
+
+def test_known_backgrounds_stand_behind_their_pixels(views):
+    cameras, images = views
+    behind = 1 - images[..., :3]
+    known = build_pool(tet_mesh("cube"), cameras, images, RENDER.march, behind)[0]
+    batch = draw_batch(jax.random.key(0), 0, known, 60, "random")
+    # Each of the cube's views has its own colours: those behind a pixel belong to its target.
+    assert_allclose(batch.background, 1 - batch.target[:, :3], atol=1e-6)
+    assert_array_equal(batch.opacity_cost, np.full(60, OPACITY_COST, np.float32))
+
+
+def test_known_alpha_has_no_opacity_cost(pool):
+    assert draw_batch(jax.random.key(0), 0, pool[0], 8, "white").opacity_cost is None
 
 
 def test_random_backgrounds_cover_the_range(pool):

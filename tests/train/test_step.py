@@ -28,6 +28,7 @@ from nimpostor_jax.train.step import (
     loss_gradient,
     make_optimizer,
     occupied_cells,
+    render_loss,
     train_step,
     trainable,
     update_thickness,
@@ -82,6 +83,21 @@ def test_loss_falls_and_the_step_compiles_once():
     _, losses = run(40)
     assert losses[-1] < 0.5 * losses[0]
     assert np.all(np.isfinite(losses))
+
+
+def test_opacity_costs_what_the_batch_says():
+    """The loss grows by the mean of cost times opacity; what is reported is the colours' error alone."""
+    impostor, batch = scene()
+    cost = jnp.linspace(0.0, 2.0, COUNT)
+    parameters = trainable(impostor)
+    loss = jax.jit(render_loss, static_argnames="config")
+    free, reported = loss(parameters, impostor, batch, config=RENDER)
+    dear, same = loss(parameters, impostor, batch.replace(opacity_cost=cost), config=RENDER)
+    render = jax.jit(render_rays, static_argnames="config")
+    opacity = render(impostor, batch.rays, RENDER, batch.jitter).opacity
+    assert float(jnp.mean(cost * opacity)) > 0.01
+    assert_allclose(dear - free, jnp.mean(cost * opacity), rtol=1e-4)  # float32, a difference of sums
+    assert_allclose(same["loss"], reported["loss"], rtol=1e-6)
 
 
 def test_steps_are_deterministic_and_counted():

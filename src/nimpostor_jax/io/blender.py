@@ -2,15 +2,13 @@
 
 Cameras follow OpenGL axes (look down -z, y up); matrices are camera-to-world. Focal lengths and
 principal points are in pixels of the returned images, pixel centres at half integers. Everything
-that can be known from the JSON and the image headers is checked before a pixel is decoded.
+that can be known from the JSON and the image headers is checked before a pixel is decoded. Where
+images have no alpha, frames may name a `background_path`: a picture of what is behind the object.
 """
 
 import dataclasses
-import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +16,15 @@ from jaxtyping import Bool, Float, Int
 
 from nimpostor_jax.config import DataConfig
 from nimpostor_jax.io.images import area_downsample, image_header, read_image
+from nimpostor_jax.io.transforms import (
+    DISTORTION_KEYS,
+    image_path,
+    intrinsics,
+    number,
+    read_json,
+    read_matrix,
+)
 from nimpostor_jax.types import Camera
-
-_RIGID_TOLERANCE = 1e-3  # on the entries of R^T R - I; JSON files carry 6 digits or more
-_DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -30,6 +33,8 @@ class PosedImages:
 
     `images` are premultiplied by alpha, values in [0, 1]; `names` are paths relative to the scene's
     folder; `has_alpha[i]` is False where the file had no alpha channel (alpha is then 1).
+    `backgrounds` are what would be seen without the object, where that is known: the object's alpha
+    is then learned from the difference.
     """
 
     images: Float[np.ndarray, "N H W 4"]
@@ -38,6 +43,7 @@ class PosedImages:
     principal: Float[np.ndarray, "N 2"]
     names: tuple[str, ...]
     has_alpha: Bool[np.ndarray, " N"]
+    backgrounds: Float[np.ndarray, "N H W 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -81,7 +87,12 @@ class PosedImages:
             principal=self.principal[index],
             names=tuple(self.names[i] for i in index),
             has_alpha=self.has_alpha[index],
+            backgrounds=None if self.backgrounds is None else self.backgrounds[index],
         )
+
+    def background(self, index: int, default: str) -> Float[np.ndarray, "H W 3"] | str:
+        """What stands behind view `index`: its own background, else the `default`."""
+        return default if self.backgrounds is None else self.backgrounds[index]
 
 
 def load_blender(folder: str | Path, split: str, resolution: int | None = None) -> PosedImages:
@@ -90,7 +101,8 @@ def load_blender(folder: str | Path, split: str, resolution: int | None = None) 
     `resolution` is the target width in pixels (None: as stored); pictures are averaged over exact
     pixel footprints in premultiplied alpha, and the intrinsics scale along. `camera_angle_x` is the
     horizontal field of view; `fl_x`, `fl_y`, `cx`, `cy` (pixels of a `w` x `h` picture) take
-    precedence, in the file or in a frame. Raises FileNotFoundError for a missing folder, JSON or
+    precedence, in the file or in a frame. `background_path` names a picture of the same size for
+    all frames or for none. Raises FileNotFoundError for a missing folder, JSON or
     image, ValueError for anything inconsistent; both name the file, and the frame where there is
     one.
     """
@@ -121,7 +133,7 @@ def load_scene(folder: str | Path, config: DataConfig) -> tuple[PosedImages, Pos
 
 def check_masks(posed: PosedImages) -> None:
     """Raise ValueError, naming the image, unless every view has a mask that shows the object."""
-    remedy = "give RGBA images whose alpha is the object's mask, or supply a cage"
+    remedy = "give RGBA images whose alpha is the object's mask, supply a cage, or use experiments/capture.py"
     without = np.flatnonzero(~posed.has_alpha)
     if without.size:
         raise ValueError(
@@ -154,6 +166,7 @@ class _Split:
     width: int
     height: int
     has_alpha: Bool[np.ndarray, " N"]
+    backgrounds: tuple[Path, ...] | None
 
 
 def _transforms_path(folder: Path, split: str) -> Path:
@@ -163,10 +176,10 @@ def _transforms_path(folder: Path, split: str) -> Path:
 def _inspect(folder: Path, split: str) -> _Split:
     """Read and check the JSON and the image headers of a split."""
     json_path = _transforms_path(folder, split)
-    meta = _read_json(folder, json_path)
+    meta = read_json(folder, json_path)
     frames = meta["frames"]
-    matrices = np.stack([_read_matrix(frame, i, json_path) for i, frame in enumerate(frames)])
-    paths = tuple(_image_path(folder, frame, i, json_path) for i, frame in enumerate(frames))
+    matrices = np.stack([read_matrix(frame, i, json_path) for i, frame in enumerate(frames)])
+    paths = tuple(image_path(folder, frame, i, json_path) for i, frame in enumerate(frames))
     headers = [image_header(path) for path in paths]
     width, height, _ = headers[0]
     for path, (w, h, _) in zip(paths, headers, strict=True):
@@ -175,20 +188,54 @@ def _inspect(folder: Path, split: str) -> _Split:
                 f"{path} is {w}x{h} but {paths[0]} is {width}x{height}; "
                 "all images of a split must have one size"
             )
-    intrinsics = [
-        _intrinsics({**meta, **f}, width, height, json_path, i) for i, f in enumerate(frames)
-    ]
+    lenses = []
+    for i, frame in enumerate(frames):
+        values = {**meta, **frame}
+        _check_undistorted(values, f"{json_path}: frame {i}")
+        lenses.append(intrinsics(values, width, height, json_path, i))
     return _Split(
         json_path=json_path,
         paths=paths,
         names=tuple(_relative(path, folder) for path in paths),
         camera_to_world=matrices,
-        focal=np.array([focal for focal, _ in intrinsics]),
-        principal=np.array([principal for _, principal in intrinsics]),
+        focal=np.array([focal for focal, _ in lenses]),
+        principal=np.array([principal for _, principal in lenses]),
         width=width,
         height=height,
         has_alpha=np.array([alpha for _, _, alpha in headers]),
+        backgrounds=_inspect_backgrounds(folder, frames, (width, height), json_path),
     )
+
+
+def _inspect_backgrounds(
+    folder: Path, frames: list[dict], size: tuple[int, int], json_path: Path
+) -> tuple[Path, ...] | None:
+    """Pictures of what is behind the object, of all frames or of none."""
+    key = "background_path"
+    without = [i for i, frame in enumerate(frames) if key not in frame]
+    if len(without) == len(frames):
+        return None
+    if without:
+        raise ValueError(
+            f"{json_path}: frame {without[0]} has no '{key}' but others have; give it to all or to none"
+        )
+    paths = tuple(image_path(folder, frame, i, json_path, key) for i, frame in enumerate(frames))
+    for path in paths:
+        width, height, _ = image_header(path)
+        if (width, height) != size:
+            raise ValueError(
+                f"background {path} is {width}x{height} but the images are {size[0]}x{size[1]}"
+            )
+    return paths
+
+
+def _check_undistorted(values: dict, where: str) -> None:
+    bent = [key for key in DISTORTION_KEYS if number(values, key, 0.0, where) != 0.0]
+    if bent:
+        raise ValueError(
+            f"{where}: lens distortion '{bent[0]}' is not supported here; undistort the images "
+            "(experiments/capture.py does)"
+        )
 
 
 def _decode(split: _Split, resolution: int | None) -> PosedImages:
@@ -196,6 +243,11 @@ def _decode(split: _Split, resolution: int | None) -> PosedImages:
     images = np.empty((len(split.paths), height, width, 4), np.float32)
     for i, path in enumerate(split.paths):
         images[i] = area_downsample(read_image(path)[0], width, height)
+    backgrounds = None
+    if split.backgrounds is not None:
+        backgrounds = np.empty((len(split.paths), height, width, 3), np.float32)
+        for i, path in enumerate(split.backgrounds):
+            backgrounds[i] = area_downsample(read_image(path)[0][..., :3], width, height)
     shrink = np.array([width / split.width, height / split.height])
     return PosedImages(
         images=images,
@@ -204,6 +256,7 @@ def _decode(split: _Split, resolution: int | None) -> PosedImages:
         principal=split.principal * shrink,
         names=split.names,
         has_alpha=split.has_alpha,
+        backgrounds=backgrounds,
     )
 
 
@@ -219,112 +272,5 @@ def _target_size(split: _Split, resolution: int | None) -> tuple[int, int]:
     return resolution, max(1, round(split.height * resolution / split.width))
 
 
-def _read_json(folder: Path, path: Path) -> dict[str, Any]:
-    if not folder.is_dir():
-        raise FileNotFoundError(f"scene folder {folder} does not exist")
-    if not path.is_file():
-        found = ", ".join(sorted(p.name for p in folder.glob("*.json"))) or "none"
-        raise FileNotFoundError(f"{path} does not exist (JSON files there: {found})")
-    try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not valid JSON ({error})") from error
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        raise ValueError(f"{path}: 'frames' must be a non-empty list of objects")
-    return meta
-
-
-def _read_matrix(frame: dict[str, Any], index: int, json_path: Path) -> Float[np.ndarray, "4 4"]:
-    """The frame's camera-to-world matrix, checked to be a rotation and a translation."""
-    where = f"{json_path}: frame {index}: 'transform_matrix'"
-    if "transform_matrix" not in frame:
-        raise ValueError(f"{where} is missing")
-    try:
-        matrix = np.asarray(frame["transform_matrix"], np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where} is not a matrix of numbers") from error
-    if matrix.shape != (4, 4):
-        raise ValueError(f"{where} has shape {matrix.shape}, expected (4, 4)")
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{where} has non-finite entries")
-    rotation = matrix[:3, :3]
-    deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    last_row = np.abs(matrix[3] - [0, 0, 0, 1]).max()
-    determinant = np.linalg.det(rotation)
-    if max(deviation, last_row) > _RIGID_TOLERANCE or determinant < 0:
-        raise ValueError(
-            f"{where} is not rigid (rotation off orthonormal by {deviation:.2g}, determinant "
-            f"{determinant:.3g}, last row {matrix[3].tolist()}); remove scale, shear and mirroring"
-        )
-    return matrix
-
-
-def _image_path(folder: Path, frame: dict[str, Any], index: int, json_path: Path) -> Path:
-    """The frame's picture; nerf-synthetic leaves the suffix `.png` out."""
-    name = frame.get("file_path")
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{json_path}: frame {index}: 'file_path' is missing or not a string")
-    path = folder / name
-    if path.is_file():
-        return path
-    with_suffix = path.with_name(path.name + ".png")
-    if with_suffix.is_file():
-        return with_suffix
-    missing = path if path.suffix.lower() in (".png", ".jpg", ".jpeg") else with_suffix
-    raise FileNotFoundError(f"image {missing} does not exist ({json_path}, frame {index})")
-
-
 def _relative(path: Path, folder: Path) -> str:
     return path.relative_to(folder).as_posix()
-
-
-def _intrinsics(
-    values: dict[str, Any], width: int, height: int, json_path: Path, index: int
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Focal lengths and principal point in pixels of the stored picture."""
-    where = f"{json_path}: frame {index}"
-
-    def number(key: str, default: float) -> float:
-        value = values.get(key, default)
-        if (
-            isinstance(value, bool)
-            or not isinstance(value, (int, float))
-            or not math.isfinite(value)
-        ):
-            raise ValueError(f"{where}: '{key}' must be a finite number, got {value!r}")
-        return float(value)
-
-    bent = [key for key in _DISTORTION_KEYS if number(key, 0.0) != 0.0]
-    if bent:
-        raise ValueError(
-            f"{where}: lens distortion '{bent[0]}' is not supported; undistort the images"
-        )
-    stated_width, stated_height = number("w", width), number("h", height)
-    if min(stated_width, stated_height) <= 0:
-        raise ValueError(
-            f"{where}: 'w' and 'h' must be positive, got {stated_width:g}x{stated_height:g}"
-        )
-    # A copy that was downsampled may be off the stated aspect by its rounding: up to one pixel.
-    if abs(stated_height * width / stated_width - height) > 1.0:
-        raise ValueError(
-            f"{where}: 'w' and 'h' say {stated_width:g}x{stated_height:g}, "
-            f"the images are {width}x{height}"
-        )
-    if "fl_x" in values:
-        focal_x = number("fl_x", 0.0)
-    elif "camera_angle_x" in values:
-        angle = number("camera_angle_x", 0.0)
-        if not 0 < angle < math.pi:
-            raise ValueError(f"{where}: 'camera_angle_x' must be in (0, pi) radians, got {angle!r}")
-        focal_x = 0.5 * stated_width / math.tan(0.5 * angle)
-    else:
-        raise ValueError(f"{where}: 'camera_angle_x' (or 'fl_x') is missing")
-    focal_y = number("fl_y", focal_x)
-    if min(focal_x, focal_y) <= 0:
-        raise ValueError(
-            f"{where}: focal lengths must be positive, got {focal_x:g} and {focal_y:g}"
-        )
-    center_x, center_y = number("cx", 0.5 * stated_width), number("cy", 0.5 * stated_height)
-    scale_x, scale_y = width / stated_width, height / stated_height
-    return (focal_x * scale_x, focal_y * scale_y), (center_x * scale_x, center_y * scale_y)

@@ -54,7 +54,13 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     impostor = fine_impostor(impostor, scene.train, config)
     train, mesh = scene.config.train, impostor.mesh
     pixels = face_pixels(world_vertices(mesh), np.asarray(mesh.tets), scene.train)
-    pool, _ = build_pool(mesh, scene.train.cameras, scene.train.images, scene.config.render.march)
+    pool, _ = build_pool(
+        mesh,
+        scene.train.cameras,
+        scene.train.images,
+        scene.config.render.march,
+        scene.train.backgrounds,
+    )
     key = jax.random.key(train.seed + 2)
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
     render = fit_config(mesh, pool, probe, scene.config.render)

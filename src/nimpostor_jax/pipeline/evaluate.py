@@ -17,7 +17,7 @@ from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.blender import PosedImages
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.lpips import MIN_SIDE as LPIPS_MIN_SIDE
-from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import Frame, frame_config, render_frame, to_image
 from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor
 
 Log = Callable[[str], None]
@@ -39,7 +39,8 @@ def evaluate(
 ) -> dict[str, Any]:
     """PSNR, SSIM and LPIPS (None without the extra `lpips`) on views, mean and per view; seconds a frame.
 
-    With `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The time is the median
+    Truth and render stand over the view's own background where it has one, else over `background`. With
+    `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The time is the median
     over the views of a whole frame, with everything but compilation.
     """
     per_view: list[dict[str, Any]] = []
@@ -50,8 +51,9 @@ def evaluate(
         start = time.perf_counter()
         frame = render_frame(impostor, camera_of(views, index), sized)
         seconds.append(time.perf_counter() - start)
-        image = to_image(frame, 1.0 if background == "white" else 0.0)
-        truth = composite(views.images[index], background)
+        behind = views.background(index, background)
+        image = composite_frame(frame, behind)
+        truth = composite(views.images[index], behind)
         per_view.append(
             {
                 "view": name,
@@ -78,6 +80,15 @@ def evaluate(
         f"{result['seconds_per_frame']:.2f} s a frame"
     )
     return result
+
+
+def composite_frame(
+    frame: Frame, background: str | Float[np.ndarray, "H W 3"]
+) -> Float[np.ndarray, "H W 3"]:
+    """A frame over "white", "black" or a picture, clipped to [0, 1]."""
+    if isinstance(background, str):
+        return to_image(frame, 1.0 if background == "white" else 0.0)
+    return to_image(frame, background)
 
 
 def _mean(values: list[float | None]) -> float | None:
@@ -108,7 +119,8 @@ def orbit(
 ) -> list[Camera]:
     """Cameras on a circle around the vertical axis, looking at the centre of what the views look at.
 
-    The radius is the views' median distance, the lens the first view's.
+    Vertical is what the views' cameras take for it: captured scenes may have any axis up. The radius is the
+    views' median distance, the lens the first view's.
     """
     positions = views.camera_to_world[:, :3, 3]
     forward = -views.camera_to_world[:, :3, 2]
@@ -116,6 +128,11 @@ def orbit(
     projectors = np.eye(3) - forward[:, :, None] * forward[:, None, :]
     center = np.linalg.lstsq(projectors.sum(0), np.einsum("nij,nj->i", projectors, positions), rcond=None)[0]
     radius = np.median(np.linalg.norm(positions - center, axis=1))
+    up = vertical(views)
+    across = np.eye(3)[np.argmin(np.abs(up) > 0.9)]  # x, unless that is near the vertical
+    across -= (across @ up) * up
+    across /= np.linalg.norm(across)
+    frame = np.stack([across, np.cross(up, across), up], axis=1)
     size = size or views.width
     zoom = size / views.width
     height = round(views.height * zoom)
@@ -131,6 +148,7 @@ def orbit(
         )
         right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         pose = np.eye(4)
+        back, right = frame @ back, frame @ right
         pose[:3] = np.stack([right, np.cross(back, right), back, center + radius * back], axis=1)
         cameras.append(
             Camera(
@@ -142,3 +160,19 @@ def orbit(
             )
         )
     return cameras
+
+
+def vertical(views: PosedImages) -> Float[np.ndarray, " 3"]:
+    """The unit direction that is up in most pictures.
+
+    Where cameras are held level, that at right angles to all their horizontal axes; else their mean up.
+    """
+    right, upward = views.camera_to_world[:, :3, 0], views.camera_to_world[:, :3, 1].mean(axis=0)
+    spread, axes = np.linalg.eigh(right.T @ right / len(right))
+    if spread[0] < _LEVEL < spread[1]:
+        return axes[:, 0] if axes[:, 0] @ upward >= 0 else -axes[:, 0]
+    length = np.linalg.norm(upward)
+    return upward / length if length > _LEVEL else np.array([0.0, 0.0, 1.0])
+
+
+_LEVEL = 0.02  # mean square of a horizontal axis' vertical part: hand-held cameras are tilted by degrees

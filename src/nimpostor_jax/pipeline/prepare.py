@@ -103,10 +103,21 @@ def prepare(
     warn_of_slow_scatter()
     train, test = load_scene(resolve_scene(data), config.data)
     log(f"{data}: {len(train)} training views, {len(test)} test views, {train.width} x {train.height}")
-    vertices, tets = load_cage(config, train, cage, cage_output, log)
+    built = load_cage(config, train, cage, cage_output, log)
+    return prepare_views(config, train, test, built, log)
+
+
+def prepare_views(
+    config: ExperimentConfig, train: PosedImages, test: PosedImages, cage: Cage, log: Log = print
+) -> Scene:
+    """A scene from views and a cage in memory. Raises ValueError where no pixel hits the cage."""
+    vertices, tets = cage
     mesh = build_tet_mesh(vertices, tets)
-    pool, missed = build_pool(mesh, train.cameras, train.images, config.render.march)
-    log(f"{len(pool.views):,} training rays hit the cage; {missed:.4%} of opaque pixels do not")
+    pool, missed = build_pool(
+        mesh, train.cameras, train.images, config.render.march, train.backgrounds
+    )
+    hits = f"{len(pool.views):,} training rays hit the cage"
+    log(f"{hits}; {missed:.4%} of opaque pixels do not" if train.has_alpha.all() else hits)
     key = jax.random.key(config.train.seed)
     config = fit_levels(config, pixels_per_cell(vertices, tets, train, 1), log)
     impostor = init_impostor(key, mesh, config.impostor)

@@ -75,6 +75,24 @@ def cage_from_images(views: PosedImages, config: CageConfig = _DEFAULT, log: Log
     return _build(grid, config, coverage, views.names, "cage", log)
 
 
+def cage_from_grid(grid: OccupancyGrid, config: CageConfig = _DEFAULT, log: Log = print) -> Cage:
+    """Vertices [V, 3] float64 and tets [T, 4] int32 around the occupied voxels of a grid.
+
+    Raises ValueError for an empty grid, a target far out of reach, or more than `config.max_missed_share` of
+    the voxels' centres outside.
+    """
+    if not grid.occupied.any():
+        raise ValueError(f"the occupancy grid {grid.occupied.shape} is empty: there is nothing to enclose")
+    log(_describe(grid))
+    centers = grid.centers
+
+    def coverage(cage: Cage) -> validate.Coverage:
+        outside = validate.outside_points(centers, *cage)
+        return validate.Coverage(np.array([len(centers)]), np.array([int(outside.sum())]), "voxels")
+
+    return _build(grid, config, coverage, None, "cage", log)
+
+
 def cage_from_surface(
     surface: str | Path | trimesh.Trimesh,
     config: CageConfig = _DEFAULT,

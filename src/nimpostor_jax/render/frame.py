@@ -278,6 +278,8 @@ def _grow(config: RenderConfig) -> RenderConfig:
     return dataclasses.replace(grow_march(config), sampler=sampler)
 
 
-def to_image(frame: Frame, background: Float[np.ndarray, " 3"] | float = 1.0) -> Float[np.ndarray, "H W 3"]:
-    """A frame over a background colour, clipped to [0, 1]."""
+def to_image(
+    frame: Frame, background: Float[np.ndarray, "*#pixels 3"] | float = 1.0
+) -> Float[np.ndarray, "H W 3"]:
+    """A frame over a background colour or picture, clipped to [0, 1]."""
     return np.clip(frame.color + (1 - frame.opacity)[..., None] * np.asarray(background), 0, 1)

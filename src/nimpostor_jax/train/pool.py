@@ -15,6 +15,8 @@ from nimpostor_jax.render.traverse import Entries, march_tables
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import Camera, TetMesh
 
+OPACITY_COST = 1e-3  # of an opaque pixel whose alpha is unknown, in units of squared colour
+
 
 @struct.dataclass
 class PixelPool:
@@ -25,10 +27,15 @@ class PixelPool:
     colors: Float[Array, "P 4"]  # premultiplied
     entries: Entries  # into the cage: pixels and cage stay, so that they are sought once
     cameras: Camera  # batched over N
+    backgrounds: Float[Array, "P 3"] | None = None  # behind the object, where that is known
 
 
 def build_pool(
-    mesh: TetMesh, cameras: Camera, images: Float[np.ndarray, "N H W 4"], march: MarchConfig
+    mesh: TetMesh,
+    cameras: Camera,
+    images: Float[np.ndarray, "N H W 4"],
+    march: MarchConfig,
+    backgrounds: Float[np.ndarray, "N H W 3"] | None = None,
 ) -> tuple[PixelPool, float]:
     """Pixels whose rays hit the cage, and the share of foreground pixels (alpha > 0.5) that do not.
 
@@ -59,6 +66,7 @@ def build_pool(
         )
     view_ids, pixel_ids = np.concatenate(views), np.concatenate(indices)
     flat = images.reshape(len(images), -1, 4)
+    behind = None if backgrounds is None else backgrounds.reshape(len(images), -1, 3)
     pool = PixelPool(
         views=jnp.asarray(view_ids, jnp.int32),
         pixels=jnp.asarray(
@@ -67,6 +75,7 @@ def build_pool(
         colors=jnp.asarray(flat[view_ids, pixel_ids]),
         entries=_concatenated(entries),
         cameras=cameras,
+        backgrounds=None if behind is None else jnp.asarray(behind[view_ids, pixel_ids]),
     )
     return pool, missed / max(foreground, 1)
 
@@ -90,12 +99,19 @@ def _one(cameras: Camera, view: int) -> Camera:
 def draw_batch(
     key: Array, step: Int[Array, ""] | int, pool: PixelPool, size: int, background: Background
 ) -> RayBatch:
-    """A batch of pixels drawn uniformly with replacement; a function of key and step alone."""
+    """A batch of pixels drawn uniformly with replacement; a function of key and step alone.
+
+    What is known to be behind a pixel stands in the place of `background`. Its alpha is unknown then, so
+    opacity has a cost: a field of the background's own colours would explain empty space as well.
+    """
     choice_key, background_key, jitter_key = jax.random.split(jax.random.fold_in(key, step), 3)
     chosen = jax.random.randint(choice_key, (size,), 0, pool.views.shape[0])
     cameras = jax.tree.map(lambda x: x[pool.views[chosen]], pool.cameras)
     rays = pixel_rays(cameras, pool.pixels[chosen] + 0.5)
-    if background == "random":
+    known = pool.backgrounds
+    if known is not None:
+        colors = known[chosen]
+    elif background == "random":
         colors = jax.random.uniform(background_key, (size, 3))
     else:
         colors = jnp.full((size, 3), 1.0 if background == "white" else 0.0)
@@ -105,4 +121,5 @@ def draw_batch(
         background=colors,
         jitter=jax.random.uniform(jitter_key, (size,)),
         entries=jax.tree.map(lambda x: x[chosen], pool.entries),
+        opacity_cost=None if known is None else jnp.full((size,), OPACITY_COST, colors.dtype),
     )

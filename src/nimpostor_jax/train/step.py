@@ -38,6 +38,7 @@ class RayBatch:
     background: Float[Array, "R 3"]
     jitter: Float[Array, " R"]
     entries: Entries | None = None  # into the cage, where it stays as it is
+    opacity_cost: Float[Array, " R"] | None = None  # added to the loss by opacity
 
 
 @struct.dataclass
@@ -130,6 +131,8 @@ def render_loss(
         used = samples.deltas > 0
         seen = cells_of(samples.tet_ids, samples.lambdas, used, *impostor.occupied.shape)
         metrics["seen_cells"] = seen.astype(loss.dtype)  # a mean over devices is as good as "any"
+    if batch.opacity_cost is not None:
+        loss += jnp.mean(batch.opacity_cost * output.opacity)
     return loss, metrics
 
 
