@@ -191,6 +191,22 @@ class NeuralImpostor:
     embedding: Embedding | None = None
     rest_vertices: Float[Array, "V 3"] | None = None  # in the mesh's frame, before it moved; None: it has not
     gates: tuple[Gate, ...] = ()  # a point is seen where all let it
+    paints: tuple["Paint", ...] = ()  # one after another
+
+
+@struct.dataclass
+class Paint:
+    """Changes colours inside a solid (Sec. 4.3, blending); fixed to the impostor as a `Gate` is.
+
+    The field's colour is multiplied by `color`; where there is a `source`, a share of it is that field's.
+    """
+
+    solid: Solid
+    corners: Float[Array, "T 4 3"]
+    states: Int[Array, " T"]  # of tets: OPEN is left alone, CLOSED is painted all over, MIXED by points
+    color: Float[Array, " 3"]
+    source: NeuralImpostor | None  # a material, where it stood when the paint was made
+    share: Float[Array, ""]  # of the source's colour
 
 
 @struct.dataclass

@@ -14,7 +14,7 @@ from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.config import SamplerConfig
 from nimpostor_jax.edit.compose import compose, object_tets
@@ -101,20 +101,23 @@ def solid_of(impostor: NeuralImpostor, threshold: float = THRESHOLD) -> Impostor
 
 def gated(impostor: NeuralImpostor, solid: Solid, *, keep_inside: bool) -> NeuralImpostor:
     """The impostor without what lies outside (or inside) a solid, both as they stand in the world."""
-    mesh = impostor.mesh
-    corners = world_vertices(mesh)[np.asarray(mesh.tets)]  # [T, 4, 3]
-    full, empty = settled_tets(solid, corners)
+    corners, full, empty = fixed_to(impostor, solid)
     kept, hidden = (full, empty) if keep_inside else (empty, full)
-    states = np.select([hidden, kept], [CLOSED, OPEN], MIXED)
+    states = jnp.asarray(np.select([hidden, kept], [CLOSED, OPEN], MIXED), jnp.int32)
+    gate = Gate(solid=solid, corners=corners, states=states, inside=keep_inside)
+    return dataclasses.replace(impostor, gates=(*impostor.gates, gate))
+
+
+def fixed_to(
+    impostor: NeuralImpostor, solid: Solid
+) -> tuple[Float[Array, "T 4 3"], Bool[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
+    """World corners of each tet's cell, and which tets are surely inside of a solid, and outside."""
+    mesh = impostor.mesh
+    corners = world_vertices(mesh)[np.asarray(mesh.tets)]
+    full, empty = settled_tets(solid, corners)
     if impostor.embedding is not None:  # from corners of tets to those of their cells
         corners = np.linalg.solve(np.asarray(impostor.embedding.lambdas, np.float64), corners)
-    gate = Gate(
-        solid=solid,
-        corners=jnp.asarray(corners, mesh.vertices.dtype),
-        states=jnp.asarray(states, jnp.int32),
-        inside=keep_inside,
-    )
-    return dataclasses.replace(impostor, gates=(*impostor.gates, gate))
+    return jnp.asarray(corners, mesh.vertices.dtype), full, empty
 
 
 def settled_tets(

@@ -21,7 +21,7 @@ from nimpostor_jax.encoding.layout import join_layouts
 from nimpostor_jax.field.decoder import Parameters
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.render.occupancy import coarser_cells
-from nimpostor_jax.types import Embedding, Gate, HashLayout, HashTables, NeuralImpostor
+from nimpostor_jax.types import Embedding, HashLayout, HashTables, NeuralImpostor
 
 
 def compose(
@@ -56,6 +56,7 @@ def compose(
     mesh = build_tet_mesh(np.concatenate(vertices), np.concatenate(tets), np.concatenate(objects), dtype)
 
     features, layout = _joined_tables(impostors)
+    num_tets = [each.mesh.tets.shape[0] for each in impostors]
     num_cells = [each.decoder_index.shape[0] for each in impostors]
     num_sets = [jax.tree.leaves(each.decoders)[0].shape[0] for each in impostors]
     index = _shifted([np.asarray(each.decoder_index) for each in impostors], num_sets)
@@ -69,7 +70,8 @@ def compose(
         occupied=_joined_occupancy(impostors),
         embedding=_joined_embedding(impostors, num_cells, dtype),
         rest_vertices=_joined_rest(impostors, transforms, mesh.scale),
-        gates=_joined_gates(impostors),
+        gates=_joined([each.gates for each in impostors], num_tets),
+        paints=_joined([each.paints for each in impostors], num_tets),
     )
 
 
@@ -179,16 +181,15 @@ def _joined_rest(
     )
 
 
-def _joined_gates(impostors: Sequence[NeuralImpostor]) -> tuple[Gate, ...]:
-    """All gates; each is open for the tets of other impostors."""
-    counts = [each.mesh.tets.shape[0] for each in impostors]
-    gates = []
-    for i, each in enumerate(impostors):
-        around = sum(counts[:i]), sum(counts[i + 1 :])
-        for gate in each.gates:
-            corners = jnp.pad(gate.corners, (around, (0, 0), (0, 0)))
-            gates.append(dataclasses.replace(gate, corners=corners, states=jnp.pad(gate.states, around)))
-    return tuple(gates)
+def _joined(parts: Sequence[tuple[Any, ...]], num_tets: Sequence[int]) -> tuple[Any, ...]:
+    """All gates, or paints; each is open for the tets of other impostors."""
+    joined = []
+    for i, own in enumerate(parts):
+        around = sum(num_tets[:i]), sum(num_tets[i + 1 :])
+        for part in own:
+            corners = jnp.pad(part.corners, (around, (0, 0), (0, 0)))
+            joined.append(dataclasses.replace(part, corners=corners, states=jnp.pad(part.states, around)))
+    return tuple(joined)
 
 
 def object_tets(impostor: NeuralImpostor, object_id: int) -> Int[np.ndarray, " tets"]:

@@ -18,12 +18,12 @@ from nimpostor_jax.edit.boolean import STEP, THRESHOLD
 from nimpostor_jax.edit.region import with_region
 from nimpostor_jax.edit.retrain import retrain
 from nimpostor_jax.field import impostor as field
-from nimpostor_jax.field.solids import CLOSED, MIXED, is_kept, to_cells
+from nimpostor_jax.field.solids import CLOSED, MIXED, OPEN, is_kept, to_cells
 from nimpostor_jax.geometry.locate import locate
 from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
-_INSIDE = 1e-5  # barycentric: how far beyond a face rounding may put a corner
+_INSIDE = 1e-6  # in the mesh's frame: how far beyond a face rounding may put a corner
 _PROBES = 1 << 16
 
 
@@ -82,19 +82,24 @@ def consolidate(
     config: RetrainConfig,
     log: Callable[[str], None] = print,
 ) -> NeuralImpostor:
-    """The result of live Boolean operations as a plain field (Eq. 15): no gates, nothing but what is seen.
+    """The result of live operations as a plain field (Eq. 15): no gates, no paints, only what is seen.
 
-    Tets that gates close are taken away, tets that they cut are trained anew, all others stay as they are.
-    Raises ValueError where everything is hidden.
+    Tets that gates close are taken away, those that are cut or painted are trained anew, all others stay as
+    they are. Raises ValueError where everything is hidden.
     """
-    if not live.gates:
+    if not live.gates and not live.paints:
         return live
     mesh, tets = live.mesh, np.asarray(live.mesh.tets)
-    states = np.stack([np.asarray(gate.states) for gate in live.gates])
-    shown = ~np.any(states == CLOSED, axis=0) & ~_empty_of(live, np.any(states == MIXED, axis=0))
+    closed, cut, painted = (np.zeros(len(tets), bool) for _ in range(3))
+    for gate in live.gates:
+        closed |= np.asarray(gate.states) == CLOSED
+        cut |= np.asarray(gate.states) == MIXED
+    for paint in live.paints:
+        painted |= np.asarray(paint.states) != OPEN
+    shown = ~closed & ~_empty_of(live, cut)
     if not shown.any():
         raise ValueError("the operation hides everything: there is nothing to consolidate")
-    cut = np.any(states == MIXED, axis=0)[shown]
+    cut = (cut | painted)[shown]
     used, inverse = np.unique(tets[shown], return_inverse=True)
     new_mesh = build_in_frame(
         mesh,
@@ -148,10 +153,12 @@ def overlay(
     edges = (old_corners[:, 1:] - old_corners[:, :1])[nearest]  # [T, 3, 3], rows are edges
     flat = np.abs(np.linalg.det(edges)) <= 0
     edges = np.where(flat[:, None, None], np.eye(3), edges)
-    last = np.einsum("tcx,txe->tce", corners - old_corners[nearest][:, :1], np.linalg.inv(edges))
-    lambdas = np.concatenate([1 - last.sum(axis=2, keepdims=True), last], axis=2)
-    near_whole = np.abs(lambdas - np.rint(lambdas)) < _INSIDE
-    lambdas = np.where(near_whole, np.rint(lambdas), lambdas)
+    slopes = np.linalg.inv(edges)  # [T, 3, 3]: columns are the gradients of the last three coordinates
+    slopes = np.concatenate([-slopes.sum(axis=2, keepdims=True), slopes], axis=2)
+    lambdas = np.einsum("tcx,txe->tce", corners - old_corners[nearest][:, :1], slopes)
+    lambdas[:, :, 0] += 1
+    off = np.abs(lambdas - np.rint(lambdas)) / np.linalg.norm(slopes, axis=1)[:, None]  # as distances
+    lambdas = np.where(off < _INSIDE, np.rint(lambdas), lambdas)
     within = (found >= 0) & ~flat & np.all(lambdas >= 0, axis=(1, 2))
     return Overlay(tets=np.where(within, nearest, -1), lambdas=lambdas, nearest=nearest)
 

@@ -26,7 +26,8 @@ from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import is_kept, to_cells
 from nimpostor_jax.geometry.locate import LocateTables, locate, locate_tables
-from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
+from nimpostor_jax.geometry.tetrahedron import corners, cross, signed_volumes
+from nimpostor_jax.render.camera import TILE
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.composite import blend_background
 from nimpostor_jax.render.occupancy import cells_of, in_occupied_cells
@@ -39,6 +40,7 @@ EMPTY_LOG_DENSITY = -8.0  # a density that no sampling step can see
 START_BATCHES = 16  # of points, for the first guess of tables and of what is occupied
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
+PICTURE_WIDTH = 200  # pixels across the cage, of the small pictures in stage 2
 
 
 @struct.dataclass
@@ -167,16 +169,28 @@ def draw_points(
 
 
 def draw_rays(key: Array, new: NeuralImpostor, region: Region, *, count: int) -> Rays:
-    """World rays from outside through points of the region, from all sides."""
+    """World rays from outside to the region, from all sides: small pictures of points in it.
+
+    Rays of one picture are neighbours: entering a cage and marching through it costs them least.
+    """
     point_key, side_key = jax.random.split(key)
     mesh = new.mesh
-    _, _, local = _random_points(point_key, mesh, region, count)
-    directions = jax.random.normal(side_key, (count, 3), local.dtype)
-    directions /= jnp.linalg.norm(directions, axis=1, keepdims=True)
+    pictures = -(-count // TILE**2)
+    _, _, points = _random_points(point_key, mesh, region, pictures)
+    forward, side = jax.random.normal(side_key, (2, pictures, 3), points.dtype)
+    forward = _unit(forward)
+    right = _unit(cross(forward, side))
     reach = 2 * jnp.max(jnp.linalg.norm(mesh.vertices, axis=1))
-    return Rays(
-        origins=mesh.center + mesh.scale * (local - reach * directions), directions=directions
-    )
+    across = (jnp.arange(TILE) - (TILE - 1) / 2) * (reach / PICTURE_WIDTH)
+    up = cross(right, forward)
+    offsets = across[:, None, None] * right[:, None, None] + across[:, None] * up[:, None, None]
+    directions = _unit(reach * forward[:, None, None] + offsets).reshape(-1, 3)[:count]
+    origins = jnp.repeat(points - reach * forward, TILE**2, axis=0)[:count]
+    return Rays(origins=mesh.center + mesh.scale * origins, directions=directions)
+
+
+def _unit(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
+    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _random_points(

@@ -5,6 +5,7 @@ cage can be moved afterwards.
 """
 
 import dataclasses
+from typing import TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,9 @@ from jaxtyping import Bool, Int
 
 from nimpostor_jax.geometry import subdivide as geometry
 from nimpostor_jax.geometry.topology import build_in_frame
-from nimpostor_jax.types import Embedding, Gate, NeuralImpostor
+from nimpostor_jax.types import Embedding, Gate, NeuralImpostor, Paint
+
+Part = TypeVar("Part", Gate, Paint)
 
 
 def subdivide(
@@ -39,12 +42,13 @@ def subdivide(
         embedding=_within(impostor.embedding, fine, mesh.vertices.dtype.name),
         rest_vertices=rest,
         gates=tuple(_by_parent(gate, fine.parents) for gate in impostor.gates),
+        paints=tuple(_by_parent(paint, fine.parents) for paint in impostor.paints),
     )
 
 
-def _by_parent(gate: Gate, parents: Int[np.ndarray, " U"]) -> Gate:
-    """A gate is a matter of cells and of the tets' maps, which the children share."""
-    return dataclasses.replace(gate, corners=gate.corners[parents], states=gate.states[parents])
+def _by_parent(part: Part, parents: Int[np.ndarray, " U"]) -> Part:
+    """A gate or paint is a matter of cells and of the tets' maps, which the children share."""
+    return dataclasses.replace(part, corners=part.corners[parents], states=part.states[parents])
 
 
 def _within(embedding: Embedding | None, fine: geometry.Subdivision, dtype: str) -> Embedding:

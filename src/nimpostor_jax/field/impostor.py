@@ -80,6 +80,7 @@ def only_decoders(impostor: NeuralImpostor) -> NeuralImpostor:
         embedding=None,
         rest_vertices=None,
         gates=(),
+        paints=(),
     )
 
 

@@ -1,4 +1,4 @@
-"""What is inside a solid, and which points of an impostor its gates let through (Eqs. 13 and 14).
+"""What is inside a solid; which points gates let through (Eqs. 13 and 14), and what colour paints give them.
 
 Axes: M points, T tets of the mesh.
 """
@@ -9,7 +9,16 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.geometry.locate import locate
-from nimpostor_jax.types import Embedding, FunctionSolid, GridSolid, ImpostorSolid, NeuralImpostor, Solid
+from nimpostor_jax.types import (
+    Embedding,
+    FunctionSolid,
+    Gate,
+    GridSolid,
+    ImpostorSolid,
+    NeuralImpostor,
+    Paint,
+    Solid,
+)
 
 OPEN, CLOSED, MIXED = 0, 1, 2  # states of a tet for a gate
 
@@ -62,8 +71,45 @@ def is_kept(
     """Whether all gates let points through, given by tet of the mesh and coordinates in its cell."""
     kept = jnp.ones(mesh_tets.shape, bool)
     for gate in impostor.gates:
-        points = jnp.sum(lambdas[:, :, None] * gate.corners[mesh_tets], axis=1)
-        states = gate.states[mesh_tets]
+        points, states = _as_made(gate, mesh_tets, lambdas)
         passes = is_inside(gate.solid, points) == gate.inside
         kept &= (states == OPEN) | ((states == MIXED) & passes)
     return kept
+
+
+def painted(
+    paints: tuple[Paint, ...],
+    mesh_tets: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
+    directions: Float[Array, "M 3"],
+    colors: Float[Array, "M 3"],
+) -> Float[Array, "M 3"]:
+    """Colours after all paints; directions are the views' in the world."""
+    for paint in paints:
+        points, states = _as_made(paint, mesh_tets, lambdas)
+        inside = (states == CLOSED) | ((states == MIXED) & is_inside(paint.solid, points))
+        new = colors * paint.color
+        if paint.source is not None:
+            material = colors_at(paint.source, points, directions)
+            new += paint.share * (material - new)
+        colors = jnp.where(inside[:, None], new, colors)
+    return colors
+
+
+def colors_at(
+    impostor: NeuralImpostor, points: Float[Array, "M 3"], directions: Float[Array, "M 3"]
+) -> Float[Array, "M 3"]:
+    """An impostor's colours at world points, seen in world directions; black outside of its cage."""
+    tets, lambdas = locate(impostor.mesh, points)
+    cells, places = to_cells(impostor.embedding, jnp.maximum(tets, 0), lambdas)
+    features = field.features(impostor, cells, places)
+    colors = field.radiance(impostor, cells, features, field.encode_directions(impostor, directions))
+    return jnp.where((tets >= 0)[:, None], colors, 0)
+
+
+def _as_made(
+    part: Gate | Paint, mesh_tets: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+) -> tuple[Float[Array, "M 3"], Int[Array, " M"]]:
+    """Where points were in the world when a gate or paint was made, and the states of their tets."""
+    points = jnp.sum(lambdas[:, :, None] * part.corners[mesh_tets], axis=1)
+    return points, part.states[mesh_tets]

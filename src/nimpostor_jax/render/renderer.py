@@ -10,6 +10,7 @@ from nimpostor_jax.chunks import map_used
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.decoder import Parameters, decode_appearance, num_decoder_sets
+from nimpostor_jax.field.solids import painted
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sum_by_ray
 from nimpostor_jax.render.sampling import Samples, place_samples, plan_samples
@@ -86,6 +87,8 @@ def integrate_samples(
     views = Views(directions=rays.directions, turns=turns)
     mesh_tets = tets if samples.mesh_tets is None else samples.mesh_tets
     if config.integrate == "features":
+        if impostor.paints:
+            raise ValueError("paints change the colour of points: RenderConfig.integrate must be 'color'")
         num_sets = num_decoder_sets(impostor.decoders)
         rows = samples.rays * num_sets + impostor.decoder_index[tets]
         sigmas = sample_densities(impostor, tets, point_features, num_used)
@@ -102,6 +105,9 @@ def integrate_samples(
             views = dataclasses.replace(views, directions=field.encode_directions(impostor, rays.directions))
         items = (tets, point_features, samples.rays, mesh_tets)
         sigmas, colors = map_used(_decode, (decoders, views), items, num_used)
+        if impostor.paints:
+            items = (mesh_tets, samples.lambdas, samples.rays, colors)
+            colors = map_used(_paint, (impostor.paints, rays.directions), items, num_used)
         weights = optical_weights(sigmas, samples)
         values = jnp.column_stack([colors, jnp.ones_like(weights), samples.t])
         sums = sum_by_ray(weights, values, samples.rays, num_rays, num_used)
@@ -121,6 +127,11 @@ def _directions_of(views: Views, part: tuple) -> Float[Array, "chunk 3"]:
     rays, mesh_tets = part
     directions, turns = views.directions[rays], views.turns[mesh_tets]  # type: ignore[index]
     return jnp.sum(turns * directions[:, :, None], axis=1)
+
+
+def _paint(shared: tuple, part: tuple) -> Float[Array, "chunk 3"]:
+    (paints, directions), (mesh_tets, lambdas, rays, colors) = shared, part
+    return painted(paints, mesh_tets, lambdas, directions[rays], colors)
 
 
 def _unit(sums: Float[Array, "N 3"], otherwise: Float[Array, "N 3"]) -> Float[Array, "N 3"]:
