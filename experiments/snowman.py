@@ -39,7 +39,7 @@ def main(argv: Sequence[str]) -> None:
     """Run the script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--out", required=True, type=Path)
-    parser.add_argument("--ball", type=Path, help="workdir of a run on fluffy_ball; without it, one is trained")
+    parser.add_argument("--ball", type=Path, help="workdir of a run on fluffy_ball; default: train one")
     parser.add_argument("--size", type=int, default=300, help="image width and height")
     parser.add_argument("--frames", type=int, default=24, help="of the animation; 0: none")
     add_flags(parser)
@@ -58,7 +58,8 @@ def main(argv: Sequence[str]) -> None:
     write_png(args.out / "frame.png", frames[0])
     if args.frames:
         write_video(args.out / "orbit.gif", frames, 12.0)
-    print(f"{len(snowman.mesh.tets)} tets in {int(snowman.mesh.object_ids.max()) + 1} objects; wrote {args.out}")
+    count = int(snowman.mesh.object_ids.max()) + 1
+    print(f"{len(snowman.mesh.tets)} tets in {count} objects; wrote {args.out}")
 
 
 def build(ball: NeuralImpostor) -> NeuralImpostor:
@@ -105,7 +106,7 @@ def hard_part(
 ) -> NeuralImpostor:
     """A closed surface filled with one colour."""
     margin = 0.02 * float(np.linalg.norm(surface.extents))
-    mesh = build_tet_mesh(*box_tets(surface.bounds + [[-margin], [margin]]))
+    mesh = build_tet_mesh(*box_tets(surface.bounds + np.array([[-margin], [margin]])))
     solid = solid_from_surface(surface, 96, allow_self_intersections=True)
     return gated(uniform(mesh, color, DENSITY, like.config), solid, keep_inside=True)
 

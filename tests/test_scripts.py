@@ -64,6 +64,41 @@ def test_train_evaluate_and_render(tmp_path):
     assert len(list((tmp_path / "orbit").glob("*.png"))) == 2
 
 
+@pytest.mark.slow
+def test_edits_come_out_of_scripts(tmp_path):
+    """A run, then a finer cage, another cage, a bite, and two of them side by side."""
+    work, few = tmp_path / "work", ["RetrainConfig.feature_steps=5", "RetrainConfig.render_steps=5"]
+    done = run("train.py", "--data=fluffy_ball", f"--workdir={work}", *SMALL)
+    assert done.returncode == 0, done.stderr
+    common = ["--data=fluffy_ball", f"--workdir={work}", "--frames=2"]
+
+    done = run("edit_remesh.py", *common, "--subdivide", timeout=900)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((work / "remesh" / "remesh.json").read_text())
+    assert result["psnr_to_before"] > 60 and result["tets_after"] > 3 * result["tets_before"]
+
+    retrain = ["--gin_bindings", *few, "CageConfig.target_tets=80"]
+    done = run("edit_remesh.py", *common, f"--out={tmp_path / 'anew'}", *retrain, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "anew" / "orbit.gif").exists() and (tmp_path / "anew" / "impostor.npz").exists()
+
+    bite = ["--operation=difference", "--pattern=sphere", "--consolidate", "--gin_bindings", *few]
+    done = run("edit_boolean.py", *common, *bite, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((work / "boolean" / "boolean.json").read_text())["psnr_consolidated_to_live"] > 10
+
+    both = [f"--out={tmp_path / 'both'}", "--size=32", "--frames=2"]
+    done = run("edit_compose.py", "--workdirs", str(work), str(work), *both, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "both" / "compose.json").read_text())["objects"] == 2
+
+    small = [f"--out={tmp_path / 'snow'}", "--size=32", "--frames=2"]
+    done = run("snowman.py", f"--ball={work}", *small, timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "snow" / "frame.png").exists()
+
+
+@pytest.mark.slow
 def test_edit_deform_compares_with_true_pictures(tmp_path):
     """The held-out views stand for pictures of an object that has hardly moved, and of one that has."""
     builtin = ROOT / "src" / "nimpostor_jax" / "data" / "fluffy_ball"
@@ -129,7 +164,7 @@ def test_bad_input_ends_in_one_line(script, arguments, message, tmp_path):
 
 SCRIPTS = [
     "train", "evaluate", "render", "make_cage", "benchmark", "demo", "bake", "table2", "capture",
-    "edit_deform", "edit_remesh", "edit_boolean", "edit_compose",
+    "edit_deform", "edit_remesh", "edit_boolean", "edit_compose", "snowman",
 ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ NOTEBOOKS = sorted((Path(__file__).resolve().parents[2] / "notebooks").glob("*.i
 
 
 # What takes several minutes is run by `make test-slow`.
-SLOW = {"02_ablation"}
+SLOW = {"02_ablation", "03_editing"}
 CASES = [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in SLOW), id=p.stem) for p in NOTEBOOKS]
 
 
