@@ -343,6 +343,8 @@ class RetrainConfig:
     points_per_batch: int = 1 << 16
     render_steps: int = 400
     rays_per_batch: int = 4096
+    views: int = 32  # pictures of the old impostor, from all around the region, that stage 2 trains on
+    view_width: int = 200
     feature_rate: float = 1e-2  # of both stages' tables; falls to a tenth in the second
     decoder_rate: float = 2e-3
     max_lost_share: float = 0.001
@@ -353,6 +355,8 @@ class RetrainConfig:
         _require(self.points_per_batch >= 1, self, "points_per_batch", ">= 1")
         _require(self.render_steps >= 0, self, "render_steps", ">= 0")
         _require(self.rays_per_batch >= 1, self, "rays_per_batch", ">= 1")
+        _require(self.views >= 1, self, "views", ">= 1")
+        _require(self.view_width >= 8, self, "view_width", ">= 8")
         _require(self.feature_rate > 0, self, "feature_rate", "> 0")
         _require(self.decoder_rate >= 0, self, "decoder_rate", ">= 0")
         _require(0 <= self.max_lost_share <= 1, self, "max_lost_share", "in [0, 1]")

@@ -97,7 +97,9 @@ def test_a_material_lends_its_colours_to_another_shape():
 @pytest.mark.slow
 def test_consolidated_paint():
     live = recolored(scenes.impostor("cube"), FunctionSolid(lower), RED)
-    config = RetrainConfig(feature_steps=20, points_per_batch=4096, render_steps=200, rays_per_batch=1024)
+    config = RetrainConfig(
+        feature_steps=20, points_per_batch=4096, render_steps=200, rays_per_batch=1024, views=6, view_width=32
+    )
     plain = consolidate(live, CONFIG, config, lambda _: None)
     assert not plain.paints
     rays = rays_of()

@@ -26,7 +26,9 @@ CONFIG = dataclasses.replace(
     scenes.exact(max_samples_per_ray=64, step=0.25),
     march=dataclasses.replace(scenes.RENDER.march, max_tets_per_ray=48, max_entries_per_ray=6),
 )
-QUICK = RetrainConfig(feature_steps=20, points_per_batch=4096, render_steps=60, rays_per_batch=512)
+QUICK = RetrainConfig(
+    feature_steps=20, points_per_batch=4096, render_steps=60, rays_per_batch=512, views=6, view_width=32
+)
 render = jax.jit(render_rays, static_argnames="config")
 
 

@@ -1,8 +1,8 @@
 """Two-stage local retraining (Sec. 4.2, Eq. 12): a region of a new impostor learns what an old one shows.
 
-Stage 1 fits the region's tables to the old field's features at random points; stage 2 its tables and its own
-decoders to the old impostor's colours along rays that cross the region. Steps are pure, (state, batch) to
-(state, loss); everything outside the region keeps its bits (`region.py`).
+Stage 1 fits the tables and decoders of the region to the old field at random points: its features, and what
+they are decoded to; stage 2 to pictures of the old impostor, along rays that cross the region. Steps are
+pure, (state, batch) to (state, loss); everything outside the region keeps its bits (`region.py`).
 
 Axes: M points, R rays, C features.
 """
@@ -21,26 +21,35 @@ from jaxtyping import Array, Bool, Float, Int
 from tqdm.auto import tqdm
 
 from nimpostor_jax.config import RenderConfig, RetrainConfig
+from nimpostor_jax.edit.boolean import STEP
 from nimpostor_jax.edit.region import Region, trained_part, with_trained_part
+from nimpostor_jax.edit.teacher import pictures_of
 from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.field import impostor as field
-from nimpostor_jax.field.solids import is_kept, to_cells
+from nimpostor_jax.field.solids import is_kept, painted, to_cells
 from nimpostor_jax.geometry.locate import LocateTables, locate, locate_tables
-from nimpostor_jax.geometry.tetrahedron import corners, cross, signed_volumes
-from nimpostor_jax.render.camera import TILE
+from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
 from nimpostor_jax.render.capacity import fit_capacities
-from nimpostor_jax.render.composite import blend_background
-from nimpostor_jax.render.occupancy import cells_of, in_occupied_cells
-from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.occupancy import cells_of, in_occupied_cells, random_points
 from nimpostor_jax.render.traverse import march_tables
-from nimpostor_jax.train.step import make_optimizer
-from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
+from nimpostor_jax.train.pool import draw_batch
+from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.step import (
+    Metrics,
+    Parameters,
+    RayBatch,
+    loss_gradient,
+    make_optimizer,
+    trainable,
+)
+from nimpostor_jax.types import NeuralImpostor, TetMesh
 
-EMPTY_LOG_DENSITY = -8.0  # a density that no sampling step can see
+FEATURE_WEIGHT = 0.1  # of features, where opacities and colours count 1
+EMPTY_SHARE = 0.1  # of the points in occupied parts, as many in others of the same volume
 START_BATCHES = 16  # of points, for the first guess of tables and of what is occupied
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
-PICTURE_WIDTH = 200  # pixels across the cage, of the small pictures in stage 2
+SYNC_EVERY = 8  # steps that may be under way at once
 
 
 @struct.dataclass
@@ -50,6 +59,9 @@ class Points:
     tets: Int[Array, " M"]  # of the new mesh
     lambdas: Float[Array, "M 4"]
     features: Float[Array, "M C"]  # 0 where there is no old field
+    densities: Float[Array, " M"]  # per unit of the new tets' barycentric measure
+    directions: Float[Array, "M 3"]  # from all sides
+    colors: Float[Array, "M 3"]  # seen from there
     present: Bool[Array, " M"]  # in the old mesh, and let through by its gates
     occupied: Bool[Array, " M"]  # also by its occupancy
 
@@ -78,7 +90,9 @@ def retrain(
         return new
     key, optimizer = jax.random.key(config.seed), make_optimizer()
     source = locate_tables(old.mesh)
-    draw = jax.jit(partial(draw_points, count=config.points_per_batch))
+    draw = jax.jit(
+        partial(draw_points, count=config.points_per_batch, measure=render.density_measure)
+    )
     guess, seen = (jnp.zeros_like(new.tables.features),) * 2, None
     for i in range(START_BATCHES):
         points = draw(jax.random.fold_in(key, i), old, source, new, region)
@@ -93,14 +107,13 @@ def retrain(
 
     state = RetrainState(part=(part := trained_part(new, region)), optimizer=optimizer.init(part))
     first = jax.jit(partial(feature_step, optimizer=optimizer), donate_argnums=0)
-    rates = {"features": config.feature_rate, "decoders": 0.0}
+    rates = {"features": config.feature_rate, "decoders": config.decoder_rate}
     losses = []
     for i in tqdm(range(config.feature_steps), desc="features", unit="step", disable=None):
         points = draw(jax.random.fold_in(key, START_BATCHES + i), old, source, new, region)
         state, loss = first(state, new, region, points, rates)
         losses.append(loss)
     _log_stage(log, "features", losses)
-    rates["decoders"] = config.decoder_rate
     state, losses = _render_stage(old, new, region, render, config, state, optimizer, rates)
     _log_stage(log, "colours", losses)
     return with_trained_part(new, region, state.part)
@@ -116,31 +129,32 @@ def _render_stage(
     optimizer: optax.GradientTransformation,
     rates: dict[str, float],
 ) -> tuple[RetrainState, list[Array]]:
-    key = jax.random.key(config.seed + 1)
-    cast = jax.jit(partial(draw_rays, count=config.rays_per_batch))
-    probe = cast(key, new, region)
-    teacher, student = (_fitted(each, probe, render) for each in (old, new))
-    step = jax.jit(partial(render_step, optimizer=optimizer, config=student), donate_argnums=0)
-    look = jax.jit(partial(render_rays, config=teacher))
-    tables, losses = jax.jit(march_tables)(old.mesh), []
+    """Stage 2, its rays split over all local devices."""
+    if not config.render_steps:
+        return state, []
+    pool, key, losses = pictures_of(old, new, region, render, config), jax.random.key(config.seed + 1), []
+    probe = draw_batch(key, 0, pool, min(PROBE_RAYS, config.rays_per_batch), "random")
+    march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.holds.shape[1])
+    sized = dataclasses.replace(render, march=march)
+    sized = fit_capacities(new.mesh, jax.jit(march_tables)(new.mesh), probe.rays, sized)
+    gradient, place = loss_gradient, (lambda batch: batch)
+    devices = jax.local_devices()
+    if len(devices) > 1 and config.rays_per_batch % len(devices) == 0:
+        mesh = device_mesh(devices)
+        state, new, region, pool = jax.device_put((state, new, region, pool), replicated(mesh))
+        gradient, place = data_parallel(mesh), partial(jax.device_put, device=over_rays(mesh))
+    step = partial(render_step, optimizer=optimizer, config=sized, gradient=gradient)
+    compiled = jax.jit(step, donate_argnums=0)
     state = dataclasses.replace(state, optimizer=optimizer.init(state.part))
     for i in tqdm(range(config.render_steps), desc="colours", unit="step", disable=None):
-        step_key = jax.random.fold_in(key, i)
-        rays = cast(step_key, new, region)
-        jitter = jax.random.uniform(jax.random.fold_in(step_key, 1), (config.rays_per_batch,))
-        seen = look(old, rays, tables=tables)
-        target = jnp.column_stack([seen.color, seen.opacity])
+        batch = place(draw_batch(key, i, pool, config.rays_per_batch, "random"))
         share = FINAL_RATE ** (i / config.render_steps)
         scaled = {name: share * rate for name, rate in rates.items()}
-        state, loss = step(state, new, region, rays, target, jitter, scaled)
+        state, loss = compiled(state, new, region, batch, scaled)
         losses.append(loss)
-    return state, losses
-
-
-def _fitted(impostor: NeuralImpostor, probe: Rays, config: RenderConfig) -> RenderConfig:
-    """With buffers for such rays."""
-    few = jax.tree.map(lambda x: x[:PROBE_RAYS], probe)
-    return fit_capacities(impostor.mesh, jax.jit(march_tables)(impostor.mesh), few, config)
+        if i % SYNC_EVERY == 0:
+            jax.block_until_ready(loss)
+    return jax.device_put(state, devices[0]), losses
 
 
 def draw_points(
@@ -151,59 +165,82 @@ def draw_points(
     region: Region,
     *,
     count: int,
+    measure: str,
 ) -> Points:
-    """Points spread evenly over the region's volume, located in the old mesh (Eq. 12, stage 1)."""
-    chosen, lambdas, local = _random_points(key, new.mesh, region, count)
-    world = new.mesh.center + new.mesh.scale * local
+    """Points in the region's tets, and what the old field has there (Eq. 12, stage 1).
+
+    Even over the volume; where occupancy is known, ten times as dense in occupied parts. `measure` is that of
+    densities: barycentric ones change with the size of tets.
+    """
+    point_key, side_key = jax.random.split(key)
+    mesh = new.mesh
+    chosen, lambdas = _random_places(point_key, new, region, count)
+    positions = corners(mesh.vertices, mesh.tets[region.tets[chosen]])
+    world = mesh.center + mesh.scale * jnp.sum(lambdas[:, :, None] * positions, axis=1)
     if region.sources is None:
         found, places = locate(old.mesh, world, source)
     else:
         found, places = region.sources[chosen], lambdas
-    cells, places = to_cells(old.embedding, jnp.maximum(found, 0), places)
-    present = (found >= 0) & is_kept(old, jnp.maximum(found, 0), places)
-    features = jnp.where((found >= 0)[:, None], field.features(old, cells, places), 0)
+    inside, tets = found >= 0, jnp.maximum(found, 0)
+    cells, places = to_cells(old.embedding, tets, places)
+    present = inside & is_kept(old, tets, places)
     occupied = present if old.occupied is None else present & in_occupied_cells(old.occupied, cells, places)
+    features = jnp.where(inside[:, None], field.features(old, cells, places), 0)
+    densities = field.density(old, cells, features)
+    if measure == "barycentric":
+        densities *= _size(mesh, region.tets[chosen]) / _cell_size(old, tets)
+    directions = _unit(jax.random.normal(side_key, (count, 3), positions.dtype))
+    colors = field.radiance(old, cells, features, field.encode_directions(old, directions))
     return Points(
-        tets=region.tets[chosen], lambdas=lambdas, features=features, present=present, occupied=occupied
+        tets=region.tets[chosen],
+        lambdas=lambdas,
+        features=features,
+        densities=jnp.where(present, densities, 0),
+        directions=directions,
+        colors=painted(old.paints, tets, places, directions, colors),
+        present=present,
+        occupied=occupied,
     )
 
 
-def draw_rays(key: Array, new: NeuralImpostor, region: Region, *, count: int) -> Rays:
-    """World rays from outside to the region, from all sides: small pictures of points in it.
+def _size(mesh: TetMesh, tets: Int[Array, " M"]) -> Float[Array, " M"]:
+    """Edge of a cube of each tet's volume; of flat tets next to nothing, but not nothing."""
+    volumes = jnp.abs(signed_volumes(corners(mesh.vertices, mesh.tets[tets])))
+    return jnp.cbrt(jnp.maximum(volumes, jnp.finfo(volumes.dtype).eps))
 
-    Rays of one picture are neighbours: entering a cage and marching through it costs them least.
-    """
-    point_key, side_key = jax.random.split(key)
-    mesh = new.mesh
-    pictures = -(-count // TILE**2)
-    _, _, points = _random_points(point_key, mesh, region, pictures)
-    forward, side = jax.random.normal(side_key, (2, pictures, 3), points.dtype)
-    forward = _unit(forward)
-    right = _unit(cross(forward, side))
-    reach = 2 * jnp.max(jnp.linalg.norm(mesh.vertices, axis=1))
-    across = (jnp.arange(TILE) - (TILE - 1) / 2) * (reach / PICTURE_WIDTH)
-    up = cross(right, forward)
-    offsets = across[:, None, None] * right[:, None, None] + across[:, None] * up[:, None, None]
-    directions = _unit(reach * forward[:, None, None] + offsets).reshape(-1, 3)[:count]
-    origins = jnp.repeat(points - reach * forward, TILE**2, axis=0)[:count]
-    return Rays(origins=mesh.center + mesh.scale * origins, directions=directions)
+
+def _cell_size(impostor: NeuralImpostor, tets: Int[Array, " M"]) -> Float[Array, " M"]:
+    """The size that the cells around tets have where these are."""
+    size = _size(impostor.mesh, tets)
+    if impostor.embedding is None:
+        return size
+    shares = jnp.abs(jnp.linalg.det(impostor.embedding.lambdas))
+    return size / jnp.cbrt(jnp.maximum(shares, jnp.finfo(shares.dtype).eps))[tets]
 
 
 def _unit(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
     return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def _random_points(
-    key: Array, mesh: TetMesh, region: Region, count: int
-) -> tuple[Int[Array, " M"], Float[Array, "M 4"], Float[Array, "M 3"]]:
-    """Which of the region's tets, where in it, and the place in the mesh's frame; even over the volume."""
+def _random_places(
+    key: Array, new: NeuralImpostor, region: Region, count: int
+) -> tuple[Int[Array, " M"], Float[Array, "M 4"]]:
+    """Which of the region's tets, and where in it."""
     choice_key, place_key = jax.random.split(key)
-    positions = corners(mesh.vertices, mesh.tets[region.tets])
-    volumes = jnp.maximum(signed_volumes(positions), 0)
-    chosen = jax.random.choice(choice_key, region.tets.size, (count,), p=volumes / jnp.sum(volumes))
-    shares = jax.random.exponential(place_key, (count, 4), positions.dtype)
-    lambdas = shares / jnp.sum(shares, axis=1, keepdims=True)
-    return chosen.astype(jnp.int32), lambdas, jnp.sum(lambdas[:, :, None] * positions[chosen], axis=1)
+    volumes = jnp.maximum(signed_volumes(corners(new.mesh.vertices, new.mesh.tets[region.tets])), 0)
+    if new.occupied is None:
+        chosen = jax.random.choice(choice_key, volumes.size, (count,), p=volumes / jnp.sum(volumes))
+        shares = jax.random.exponential(place_key, (count, 4), volumes.dtype)
+        return chosen, shares / jnp.sum(shares, axis=1, keepdims=True)
+    occupied = new.occupied[_cells_of_region(new, region)]
+    weights = (volumes[:, None] * jnp.where(occupied, 1.0, EMPTY_SHARE)).reshape(-1)
+    parts = jax.random.choice(choice_key, weights.size, (count,), p=weights / jnp.sum(weights))
+    chosen, lambdas = random_points(place_key, parts, occupied.shape[1])
+    return chosen, lambdas.astype(volumes.dtype)
+
+
+def _cells_of_region(new: NeuralImpostor, region: Region) -> Int[Array, " n"]:
+    return region.tets if new.embedding is None else new.embedding.cells[region.tets]
 
 
 @jax.jit
@@ -234,21 +271,27 @@ def _seen_or_old(new: NeuralImpostor, region: Region, seen: Array | None) -> Arr
     """The parts of the region's cells that were seen; those of others as before."""
     if new.occupied is None or seen is None:
         return new.occupied
-    cells = region.tets if new.embedding is None else new.embedding.cells[region.tets]
+    cells = _cells_of_region(new, region)
     return new.occupied.at[cells].set(seen[cells])
 
 
 def feature_loss(
     part: dict[str, Any], new: NeuralImpostor, region: Region, points: Points
 ) -> Float[Array, ""]:
-    """Stage 1 of Eq. 12: L1 to the old features; where there is no old field, to a density of nothing."""
+    """Stage 1: L1 to the old features (Eq. 12), and to the opacity of a step and the colour that they mean.
+
+    Features of hashed levels cannot be met, since other nodes share their entries; what they mean can.
+    """
     new = with_trained_part(new, region, part)
     cells, places = to_cells(new.embedding, points.tets, points.lambdas)
     features = field.features(new, cells, places)
-    off = jnp.mean(jnp.abs(features - points.features), axis=1)
-    log_density = jnp.log(field.density(new, cells, features))
-    haze = jnp.maximum(log_density - EMPTY_LOG_DENSITY, 0)
-    return jnp.mean(jnp.where(points.present, off, 0.1 * haze))
+    colors = field.radiance(new, cells, features, field.encode_directions(new, points.directions))
+    opacity, target = (
+        -jnp.expm1(-STEP * sigma) for sigma in (field.density(new, cells, features), points.densities)
+    )
+    off_features = jnp.where(points.present, jnp.mean(jnp.abs(features - points.features), axis=1), 0)
+    off_colors = target * jnp.mean(jnp.abs(colors - points.colors), axis=1)
+    return jnp.mean(FEATURE_WEIGHT * off_features + jnp.abs(opacity - target) + off_colors)
 
 
 def feature_step(
@@ -265,41 +308,28 @@ def feature_step(
     return _stepped(state, gradients, rates, optimizer), loss
 
 
-def render_loss(
-    part: dict[str, Any],
-    new: NeuralImpostor,
-    region: Region,
-    rays: Rays,
-    target: Float[Array, "R 4"],
-    jitter: Float[Array, " R"],
-    config: RenderConfig,
-) -> Float[Array, ""]:
-    """Stage 2 of Eq. 12: squared error of colours over black and over white; overflown rays count as zero."""
-    output = render_rays(with_trained_part(new, region, part), rays, config, jitter)
-    losses = []
-    for shade in (0.0, 1.0):
-        background = jnp.full(3, shade, target.dtype)
-        color = blend_background(output.color, output.opacity, background)
-        expected = blend_background(target[:, :3], target[:, 3], background)
-        losses.append(jnp.mean((color - expected) ** 2, axis=1))
-    return jnp.mean(jnp.where(output.overflow, 0, losses[0] + losses[1])) / 2
-
-
 def render_step(
     state: RetrainState,
     new: NeuralImpostor,
     region: Region,
-    rays: Rays,
-    target: Float[Array, "R 4"],
-    jitter: Float[Array, " R"],
+    batch: RayBatch,
     rates: dict[str, Any],
     *,
     optimizer: optax.GradientTransformation,
     config: RenderConfig,
+    gradient: Callable[..., tuple[Parameters, Metrics]] = loss_gradient,
 ) -> tuple[RetrainState, Float[Array, ""]]:
-    """One step of stage 2."""
-    loss, gradients = jax.value_and_grad(render_loss)(state.part, new, region, rays, target, jitter, config)
-    return _stepped(state, gradients, rates, optimizer), loss
+    """One step of stage 2 (Eq. 12): training's own loss, of which the region's share is used.
+
+    `gradient` may be a sharded `loss_gradient` (`train.sharding.data_parallel`).
+    """
+    whole = trainable(with_trained_part(new, region, state.part))
+    found, metrics = gradient(whole, new, batch, config)
+    gradients = {
+        "features": found["features"][region.entries],
+        "decoders": jax.tree.map(lambda x: x[region.decoder_sets], found["decoders"]),
+    }
+    return _stepped(state, gradients, rates, optimizer), metrics["loss"]
 
 
 def _stepped(
