@@ -59,7 +59,7 @@ def test_one_impostor_composed_is_itself(integrate):
     assert_same_picture(render(composed, rays, config), expected, 1e-5)
 
 
-@pytest.mark.parametrize("count", [2, 10])
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 10])
 def test_overlapping_objects_are_merged_by_depth(count, x64):
     """Against a float64 loop over all of a ray's samples by depth, each decoded by its own impostor."""
     kinds = ["blobs", "delaunay", "cube"]
@@ -96,6 +96,7 @@ def test_overlapping_objects_are_merged_by_depth(count, x64):
     assert switches > 4 * count  # objects did overlap, and not just follow each other
 
 
+@pytest.mark.slow
 def test_optical_depths_of_overlapping_objects_add_up():
     """Constant densities: what lets light through is the product, up to steps that straddle two objects."""
     made = [scenes.constant_density(scenes.impostor("blobs", seed=i), i - 2.0) for i in range(3)]
@@ -134,8 +135,14 @@ def test_nesting_and_saving_change_nothing(tmp_path):
     assert_array_equal(render(load_impostor(tmp_path / "flat.npz"), rays, CONFIG).color, expected.color)
 
 
-@pytest.mark.parametrize("layout", ["per_simplex", "per_tet"])
-@pytest.mark.parametrize("interpolation", ["simplex", "grid"])
+@pytest.mark.parametrize(
+    "layout, interpolation",
+    [
+        ("per_simplex", "simplex"),
+        pytest.param("per_tet", "simplex", marks=pytest.mark.slow),
+        pytest.param("per_simplex", "grid", marks=pytest.mark.slow),
+    ],
+)
 def test_levels_and_table_sizes_may_differ(layout, interpolation):
     """A level dense in one and hashed in the other, and one that the other does not have."""
 

@@ -32,7 +32,7 @@ def rays_of():
     return pixel_rays(scenes.camera(), image_pixels(9, 12).reshape(-1, 2))
 
 
-@pytest.mark.parametrize("integrate", ["color", "features"])
+@pytest.mark.parametrize("integrate", ["color", pytest.param("features", marks=pytest.mark.slow)])
 def test_a_rigid_motion_of_object_and_camera_changes_nothing(integrate):
     made, rays = subdivide(scenes.impostor("blobs")), rays_of()
     turned = deform(made, rigid(ROTATION, SHIFT))
