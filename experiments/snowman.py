@@ -2,8 +2,8 @@
 
     python experiments/snowman.py --out=out/snowman
 
-Trains the built-in furry ball (or takes --ball, the workdir of such a run), whose fur stands for snow: three
-balls, arms (a stretched ball with the colours of wood), a hat, a nose and eyes, composed into one impostor.
+Trains the built-in furry ball (or takes --ball, the workdir of such a run) and gives its fur the colours of
+snow and of wood: three balls, arms (stretched balls), a hat, a nose and eyes, composed into one impostor.
 Writes impostor.npz, frame.png and orbit.gif.
 """
 
@@ -16,7 +16,7 @@ import trimesh
 from edit_compose import around
 from edit_deform import load_run
 
-from nimpostor_jax.edit.appearance import recolored, uniform
+from nimpostor_jax.edit.appearance import uniform, with_material
 from nimpostor_jax.edit.boolean import gated
 from nimpostor_jax.edit.compose import compose
 from nimpostor_jax.export.video import write_video
@@ -32,7 +32,9 @@ from nimpostor_jax.render.frame import frame_config, render_frame, to_image
 from nimpostor_jax.types import NeuralImpostor
 
 DENSITY = 300.0  # of hard parts: opaque within a hundredth of their box
-WOOD, HAT, CARROT, COAL = (0.45, 0.28, 0.12), (0.08, 0.08, 0.1), (0.95, 0.45, 0.08), (0.03, 0.03, 0.03)
+SNOW, WOOD = (0.93, 0.95, 0.99), (0.45, 0.28, 0.12)
+HAT, CARROT, COAL = (0.08, 0.08, 0.1), (0.95, 0.45, 0.08), (0.03, 0.03, 0.03)
+MATERIAL = 0.8  # share of a material's colour; the rest is the fur's own light and shade
 
 
 def main(argv: Sequence[str]) -> None:
@@ -45,6 +47,8 @@ def main(argv: Sequence[str]) -> None:
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
+    if args.size < 8:
+        raise ValueError(f"--size must be >= 8, got {args.size}")
     config = config_from_args(args)
     if args.ball is not None:
         ball = load_run(args.ball, "fluffy_ball")
@@ -64,9 +68,8 @@ def main(argv: Sequence[str]) -> None:
 
 def build(ball: NeuralImpostor) -> NeuralImpostor:
     """The snowman: z is up, it looks along -y, and is about five units tall."""
-    body = [placed(ball, size, (0, 0, z)) for size, z in ((1.3, 1.2), (1.0, 2.9), (0.7, 4.2))]
-    whole = solid_from_surface(trimesh.creation.box(bounds=100 * np.array([[-1.0] * 3, [1.0] * 3])), 16)
-    wood = recolored(ball, whole, WOOD)
+    snow, wood = (colored(ball, color) for color in (SNOW, WOOD))
+    body = [placed(snow, size, (0, 0, z)) for size, z in ((1.3, 1.2), (1.0, 2.9), (0.7, 4.2))]
     arms = [
         placed(wood, (0.9, 0.1, 0.1), (side * 1.5, 0, 3.2), turn=-side * 0.5) for side in (-1.0, 1.0)
     ]
@@ -82,6 +85,14 @@ def build(ball: NeuralImpostor) -> NeuralImpostor:
     eyes = [trimesh.creation.icosphere(3, 0.09).apply_translation([x, -0.64, 4.42]) for x in (-0.22, 0.22)]
     hard = [(hat, HAT), (nose, CARROT), *((eye, COAL) for eye in eyes)]
     return compose([*body, *arms, *(hard_part(surface, color, ball) for surface, color in hard)])
+
+
+def colored(ball: NeuralImpostor, color: tuple[float, ...]) -> NeuralImpostor:
+    """The ball with most of its colour replaced."""
+    vertices = world_vertices(ball.mesh)
+    around = trimesh.creation.box(bounds=[vertices.min(axis=0) - 1, vertices.max(axis=0) + 1])
+    material = uniform(ball.mesh, color, DENSITY, ball.config)
+    return with_material(ball, solid_from_surface(around, 16), material, MATERIAL)
 
 
 def shift(x: float, y: float, z: float) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 What an operation removes is hidden by gates, decided first for whole tets and then, in tets that are cut, for
 single samples. Gates follow the cage when it moves, so that results can be deformed, composed and saved.
-`retrain.consolidate` turns a live result into a plain field.
+`remesh.consolidate` turns a live result into a plain field.
 
 Each operand's own density stays as it is where it is kept. A point counts as filled where the optical depth
 of one sampling step exceeds `threshold`: densities are per barycentric unit, and thin haze should not cut.

@@ -20,7 +20,7 @@ from nimpostor_jax.config import ImpostorConfig
 from nimpostor_jax.encoding.layout import join_layouts
 from nimpostor_jax.field.decoder import Parameters
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
-from nimpostor_jax.render.occupancy import coarser_cells
+from nimpostor_jax.render.occupancy import finer_cells
 from nimpostor_jax.types import Embedding, HashLayout, HashTables, NeuralImpostor
 
 
@@ -31,7 +31,8 @@ def compose(
 
     Objects are numbered in `mesh.object_ids`, those of impostors that are composed themselves too. Impostors
     may have different cages, numbers of levels and table sizes, but must agree in everything else of their
-    configs. With `RenderConfig.directions` "rest" each object's view dependence turns with it.
+    configs. With `RenderConfig.directions` "rest" each object's view dependence turns with it. Densities must
+    be barycentric (`RenderConfig.density_measure`): Euclidean ones are per unit of a frame that changes here.
 
     Raises:
         ValueError: no impostor, as many transforms as there are not impostors, a matrix that is not affine or
@@ -140,12 +141,19 @@ def _padded(decoders: Parameters, config: ImpostorConfig, wanted: ImpostorConfig
 
 
 def _joined_occupancy(impostors: Sequence[NeuralImpostor]) -> jax.Array | None:
-    """At the resolution that all can be brought to; None where an impostor has none."""
-    grids = [each.occupied for each in impostors]
-    if any(grid is None for grid in grids):
+    """At the finest of their resolutions; all of an impostor that has none counts as occupied."""
+    known = [each.occupied.shape[1] for each in impostors if each.occupied is not None]
+    if not known:
         return None
-    parts = min(grid.shape[1] for grid in grids)  # type: ignore[union-attr]
-    return jnp.concatenate([coarser_cells(grid, parts) for grid in grids])  # type: ignore[arg-type]
+    parts = max(known)
+    return jnp.concatenate(
+        [
+            jnp.ones((each.decoder_index.shape[0], parts), bool)
+            if each.occupied is None
+            else finer_cells(each.occupied, parts)
+            for each in impostors
+        ]
+    )
 
 
 def _joined_embedding(

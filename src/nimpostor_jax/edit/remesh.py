@@ -25,6 +25,7 @@ from nimpostor_jax.types import NeuralImpostor, TetMesh
 
 _INSIDE = 1e-6  # in the mesh's frame: how far beyond a face rounding may put a corner
 _PROBES = 1 << 16
+_LOOKS, _POINTS_A_LOOK = 32, 64  # into tets of which perhaps nothing is left, until something is found
 
 
 class Overlay(NamedTuple):
@@ -49,9 +50,11 @@ def transfer(
     decoders of their own and two-stage retraining. Raises ValueError for a bad mesh, cages that do not
     overlap, or where more than `config.max_lost_share` of what the old field shows lies outside the new cage.
     """
-    if old.gates:
-        raise ValueError("consolidate live Boolean operations before the impostor is remeshed")
+    if old.gates or old.paints:
+        raise ValueError("consolidate live operations (gates, paints) before the impostor is remeshed")
     mesh = old.mesh
+    if len(np.unique(np.asarray(mesh.object_ids))) > 1:
+        raise ValueError("the impostor has several objects: remesh them one by one, and compose the results")
     local = (np.asarray(vertices, np.float64) - np.asarray(mesh.center)) / np.float64(mesh.scale)
     # Vertices that are the old ones keep their bits.
     distance, twin = cKDTree(np.asarray(mesh.vertices, np.float64)).query(local)
@@ -126,10 +129,15 @@ def _empty_of(live: NeuralImpostor, cut: Bool[np.ndarray, " T"]) -> Bool[np.ndar
     left = np.zeros(len(cut), bool)
     rows = np.flatnonzero(cut)
     test = jax.jit(is_kept)
-    for _ in range(64 if len(rows) else 0):
-        lambdas = jnp.asarray(rng.dirichlet(np.ones(4), len(rows)), live.mesh.vertices.dtype)
-        tets = jnp.asarray(rows, jnp.int32)
-        left[rows] |= np.asarray(test(live, tets, to_cells(live.embedding, tets, lambdas)[1]))
+    for _ in range(_LOOKS):
+        rows = np.resize(rows[~left[rows]], len(rows)) if not left[rows].all() else rows[:0]
+        if not len(rows):
+            break
+        many = np.tile(rows, _POINTS_A_LOOK)
+        lambdas = jnp.asarray(rng.dirichlet(np.ones(4), len(many)), live.mesh.vertices.dtype)
+        tets = jnp.asarray(many, jnp.int32)
+        kept = np.asarray(test(live, tets, to_cells(live.embedding, tets, lambdas)[1]))
+        left[many[kept]] = True
     return cut & ~left
 
 

@@ -30,7 +30,7 @@ from nimpostor_jax.field.solids import is_kept, painted, to_cells
 from nimpostor_jax.geometry.locate import LocateTables, locate, locate_tables
 from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
 from nimpostor_jax.render.capacity import fit_capacities
-from nimpostor_jax.render.occupancy import cells_of, in_occupied_cells, random_points
+from nimpostor_jax.render.occupancy import in_occupied_cells, random_points
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
@@ -46,7 +46,8 @@ from nimpostor_jax.types import NeuralImpostor, TetMesh
 
 FEATURE_WEIGHT = 0.1  # of features, where opacities and colours count 1
 EMPTY_SHARE = 0.1  # of the points in occupied parts, as many in others of the same volume
-START_BATCHES = 16  # of points, for the first guess of tables and of what is occupied
+START_BATCHES = 16  # of points, for the first guess of tables
+OCCUPANCY_POINTS = 16  # in each part of a new cell, to find out what is occupied
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
 SYNC_EVERY = 8  # steps that may be under way at once
@@ -63,7 +64,6 @@ class Points:
     directions: Float[Array, "M 3"]  # from all sides
     colors: Float[Array, "M 3"]  # seen from there
     present: Bool[Array, " M"]  # in the old mesh, and let through by its gates
-    occupied: Bool[Array, " M"]  # also by its occupancy
 
 
 @struct.dataclass
@@ -93,17 +93,16 @@ def retrain(
     draw = jax.jit(
         partial(draw_points, count=config.points_per_batch, measure=render.density_measure)
     )
-    guess, seen = (jnp.zeros_like(new.tables.features),) * 2, None
+    new = dataclasses.replace(new, occupied=occupancy_of(old, source, new, region, config))
+    guess = (jnp.zeros_like(new.tables.features),) * 2
     for i in range(START_BATCHES):
-        points = draw(jax.random.fold_in(key, i), old, source, new, region)
-        guess = _add_points(guess, new, points)
-        seen = _add_seen(seen, new, points)
+        guess = _add_points(guess, new, draw(jax.random.fold_in(key, i), old, source, new, region))
     sums, weights = guess
     mean = sums / jnp.where(weights > 0, weights, 1)
     tables = dataclasses.replace(
         new.tables, features=new.tables.features.at[region.entries].set(mean[region.entries])
     )
-    new = dataclasses.replace(new, tables=tables, occupied=_seen_or_old(new, region, seen))
+    new = dataclasses.replace(new, tables=tables)
 
     state = RetrainState(part=(part := trained_part(new, region)), optimizer=optimizer.init(part))
     first = jax.jit(partial(feature_step, optimizer=optimizer), donate_argnums=0)
@@ -175,21 +174,14 @@ def draw_points(
     point_key, side_key = jax.random.split(key)
     mesh = new.mesh
     chosen, lambdas = _random_places(point_key, new, region, count)
-    positions = corners(mesh.vertices, mesh.tets[region.tets[chosen]])
-    world = mesh.center + mesh.scale * jnp.sum(lambdas[:, :, None] * positions, axis=1)
-    if region.sources is None:
-        found, places = locate(old.mesh, world, source)
-    else:
-        found, places = region.sources[chosen], lambdas
+    found, cells, places = _in_old(old, source, new, region, chosen, lambdas)
     inside, tets = found >= 0, jnp.maximum(found, 0)
-    cells, places = to_cells(old.embedding, tets, places)
     present = inside & is_kept(old, tets, places)
-    occupied = present if old.occupied is None else present & in_occupied_cells(old.occupied, cells, places)
     features = jnp.where(inside[:, None], field.features(old, cells, places), 0)
     densities = field.density(old, cells, features)
     if measure == "barycentric":
         densities *= _size(mesh, region.tets[chosen]) / _cell_size(old, tets)
-    directions = _unit(jax.random.normal(side_key, (count, 3), positions.dtype))
+    directions = _unit(jax.random.normal(side_key, (count, 3), lambdas.dtype))
     colors = field.radiance(old, cells, features, field.encode_directions(old, directions))
     return Points(
         tets=region.tets[chosen],
@@ -199,14 +191,13 @@ def draw_points(
         directions=directions,
         colors=painted(old.paints, tets, places, directions, colors),
         present=present,
-        occupied=occupied,
     )
 
 
 def _size(mesh: TetMesh, tets: Int[Array, " M"]) -> Float[Array, " M"]:
     """Edge of a cube of each tet's volume; of flat tets next to nothing, but not nothing."""
     volumes = jnp.abs(signed_volumes(corners(mesh.vertices, mesh.tets[tets])))
-    return jnp.cbrt(jnp.maximum(volumes, jnp.finfo(volumes.dtype).eps))
+    return jnp.cbrt(jnp.maximum(volumes, jnp.finfo(volumes.dtype).tiny))
 
 
 def _cell_size(impostor: NeuralImpostor, tets: Int[Array, " M"]) -> Float[Array, " M"]:
@@ -215,7 +206,7 @@ def _cell_size(impostor: NeuralImpostor, tets: Int[Array, " M"]) -> Float[Array,
     if impostor.embedding is None:
         return size
     shares = jnp.abs(jnp.linalg.det(impostor.embedding.lambdas))
-    return size / jnp.cbrt(jnp.maximum(shares, jnp.finfo(shares.dtype).eps))[tets]
+    return size / jnp.cbrt(jnp.maximum(shares, jnp.finfo(shares.dtype).tiny))[tets]
 
 
 def _unit(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
@@ -257,22 +248,66 @@ def _add_points(guess: tuple[Array, Array], new: NeuralImpostor, points: Points)
     return guess[0] + pull(points.features * weight)[0], guess[1] + pull(weight)[0]
 
 
-@jax.jit
-def _add_seen(seen: Array | None, new: NeuralImpostor, points: Points) -> Array | None:
-    """Parts of cells in which the old field is occupied."""
-    if new.occupied is None:
-        return None
-    cells, places = to_cells(new.embedding, points.tets, points.lambdas)
-    found = cells_of(cells, places, points.occupied, *new.occupied.shape)
-    return found if seen is None else seen | found
+def occupancy_of(
+    old: NeuralImpostor,
+    source: LocateTables,
+    new: NeuralImpostor,
+    region: Region,
+    config: RetrainConfig,
+) -> Bool[Array, "C parts"] | None:
+    """The new impostor's occupancy, with that of the old one in the region's cells. Host loop.
 
-
-def _seen_or_old(new: NeuralImpostor, region: Region, seen: Array | None) -> Array | None:
-    """The parts of the region's cells that were seen; those of others as before."""
-    if new.occupied is None or seen is None:
+    Every part of every cell is looked into at as many points: what is missed here is never rendered again.
+    """
+    if new.occupied is None or old.occupied is None:
         return new.occupied
-    cells = _cells_of_region(new, region)
-    return new.occupied.at[cells].set(seen[cells])
+    cells, num_parts = np.asarray(_cells_of_region(new, region)), new.occupied.shape[1]
+    everything = np.arange(len(cells) * num_parts)
+    found, batch = np.zeros(everything.size, bool), config.points_per_batch
+    look = jax.jit(_occupied_at)
+    key = jax.random.key(config.seed + 2)
+    for _ in range(OCCUPANCY_POINTS):
+        for start in range(0, everything.size, batch):
+            key, point_key = jax.random.split(key)
+            parts = np.resize(everything[start : start + batch], batch)
+            hits = np.asarray(look(point_key, old, source, new, region, jnp.asarray(parts, jnp.int32)))
+            found[parts] |= hits
+    return new.occupied.at[cells].set(jnp.asarray(found.reshape(len(cells), num_parts)))
+
+
+def _occupied_at(
+    key: Array,
+    old: NeuralImpostor,
+    source: LocateTables,
+    new: NeuralImpostor,
+    region: Region,
+    parts: Int[Array, " M"],
+) -> Bool[Array, " M"]:
+    """Whether the old impostor is occupied at a random point of each part, numbered over the region."""
+    assert new.occupied is not None and old.occupied is not None
+    chosen, lambdas = random_points(key, parts, new.occupied.shape[1])
+    tets, cells, places = _in_old(old, source, new, region, chosen, lambdas.astype(new.mesh.vertices.dtype))
+    held = jnp.maximum(tets, 0)
+    return (tets >= 0) & in_occupied_cells(old.occupied, cells, places) & is_kept(old, held, places)
+
+
+def _in_old(
+    old: NeuralImpostor,
+    source: LocateTables,
+    new: NeuralImpostor,
+    region: Region,
+    chosen: Int[Array, " M"],
+    lambdas: Float[Array, "M 4"],
+) -> tuple[Int[Array, " M"], Int[Array, " M"], Float[Array, "M 4"]]:
+    """Points in the region's tets, by number, in the old mesh: tets (-1 outside), cells, coordinates."""
+    mesh = new.mesh
+    if region.sources is None:
+        positions = corners(mesh.vertices, mesh.tets[region.tets[chosen]])
+        world = mesh.center + mesh.scale * jnp.sum(lambdas[:, :, None] * positions, axis=1)
+        found, places = locate(old.mesh, world, source)
+    else:
+        found, places = region.sources[chosen], lambdas
+    return found, *to_cells(old.embedding, jnp.maximum(found, 0), places)
 
 
 def feature_loss(

@@ -26,7 +26,10 @@ OPEN, CLOSED, MIXED = 0, 1, 2  # states of a tet for a gate
 def is_inside(solid: Solid, points: Float[Array, "M 3"]) -> Bool[Array, " M"]:
     """Whether each world point is inside the solid."""
     if isinstance(solid, FunctionSolid):
-        return solid.function(points) > 0
+        values = solid.function(points)
+        if jnp.shape(values) != points.shape[:-1]:
+            raise ValueError(f"a solid's function must return {points.shape[:-1]}, got {jnp.shape(values)}")
+        return values > 0
     if isinstance(solid, GridSolid):
         return grid_value(solid, points) > 0
     return _fills(solid, points)
@@ -99,12 +102,14 @@ def painted(
 def colors_at(
     impostor: NeuralImpostor, points: Float[Array, "M 3"], directions: Float[Array, "M 3"]
 ) -> Float[Array, "M 3"]:
-    """An impostor's colours at world points, seen in world directions; black outside of its cage."""
+    """An impostor's colours at world points, seen in world directions; black where there is nothing of it."""
     tets, lambdas = locate(impostor.mesh, points)
-    cells, places = to_cells(impostor.embedding, jnp.maximum(tets, 0), lambdas)
+    held = jnp.maximum(tets, 0)
+    cells, places = to_cells(impostor.embedding, held, lambdas)
     features = field.features(impostor, cells, places)
     colors = field.radiance(impostor, cells, features, field.encode_directions(impostor, directions))
-    return jnp.where((tets >= 0)[:, None], colors, 0)
+    colors = painted(impostor.paints, held, places, directions, colors)
+    return jnp.where(((tets >= 0) & is_kept(impostor, held, places))[:, None], colors, 0)
 
 
 def _as_made(

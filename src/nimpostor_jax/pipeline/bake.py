@@ -51,6 +51,8 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     gather in each of the others, and refines them on the training views. Raises ValueError where the textures
     would need more than `max_megabytes`, or faces have no area.
     """
+    if impostor.gates or impostor.paints:
+        raise ValueError("consolidate live operations (gates, paints) before the impostor is baked")
     impostor = fine_impostor(impostor, scene.train, config)
     train, mesh = scene.config.train, impostor.mesh
     pixels = face_pixels(world_vertices(mesh), np.asarray(mesh.tets), scene.train)

@@ -30,6 +30,11 @@ def solid_from_surface(
     grid = voxelize_surface(mesh, resolution, source, allow_self_intersections)
     # Voxels that the surface touches count as occupied: half a voxel too many on each side.
     values = signed_distances(grid.occupied) - 0.5
+    if not values.max() > 0:
+        raise ValueError(
+            f"{source}: nothing of it is thicker than two voxels of {grid.voxel_size:g}; "
+            f"raise the resolution ({resolution})"
+        )
     return _solid(values, np.eye(3) * grid.voxel_size, grid.origin)
 
 

@@ -51,10 +51,10 @@ def shade_segments(baked: BakedImpostor, rays: Rays, segments: TetSegments) -> R
     channels = tet_channels(baked, segments, num_used)
     light = transmittance(-jnp.log1p(-channels[:, -2]), segments.rays, num_used)
     num_rays, num_sets = rays.origins.shape[0], num_decoder_sets(baked.decoders)
-    rows = segments.rays * num_sets + baked.decoder_index[segments.tet_ids]
+    rows = baked.decoder_index[segments.tet_ids] * num_rays + segments.rays
     sums = sum_by_ray(light, channels, rows, num_rays * num_sets, num_used)
     directions = spherical_harmonics(rays.directions, baked.config.decoder.sh_degree)
-    sums = decode_integrated(baked.decoders, sums, jnp.repeat(directions, num_sets, axis=0))
+    sums = decode_integrated(baked.decoders, sums, jnp.tile(directions, (num_sets, 1)))
     return ray_output(sums, baked.mesh.scale, segments.overflow, jnp.zeros_like(segments.overflow))
 
 

@@ -68,20 +68,18 @@ def in_occupied_cells(
     return occupied.reshape(-1).at[index].get(mode="promise_in_bounds")
 
 
-def coarser_cells(occupied: Bool[Array, "T C"], parts: int) -> Bool[Array, "T parts"]:
-    """The same grid with fewer cells a tet: occupied where one of those around it is.
+def finer_cells(occupied: Bool[Array, "T C"], parts: int) -> Bool[Array, "T parts"]:
+    """The same grid with more cells a tet, each as the one that it lies in.
 
-    Where the edges are not cut into a multiple of the parts asked for, everything counts as occupied.
+    Where the edges are not cut into a multiple of what they were, everything counts as occupied.
     """
-    fine, coarse = cell_resolution(occupied.shape[1]), cell_resolution(parts)
+    coarse, fine = cell_resolution(occupied.shape[1]), cell_resolution(parts)
     if fine % coarse:
         return jnp.ones((occupied.shape[0], parts), bool)
-    factor = fine // coarse
-    i, j, k = (_corners(fine) // factor).T  # space = i + j + k may exceed the grid by rounding down
-    plane = np.minimum(j + k, coarse - 1)
-    space = np.minimum(i + plane, coarse - 1)
-    index = space * (space + 1) * (space + 2) // 6 + plane * (plane + 1) // 2 + np.minimum(k, plane)
-    return jnp.zeros((occupied.shape[0], parts), bool).at[:, index].max(occupied)
+    middles = (_corners(fine) + 0.25) / fine  # 0.25: within the cells that the face lambda_3 = 0 cuts, too
+    places = jnp.asarray(np.column_stack([middles, 1 - middles.sum(axis=1)]), jnp.float32)
+    index = cell_index(jnp.zeros(parts, jnp.int32), places, occupied.shape[1])
+    return occupied[:, index]
 
 
 def cells_of(

@@ -90,12 +90,12 @@ def integrate_samples(
         if impostor.paints:
             raise ValueError("paints change the colour of points: RenderConfig.integrate must be 'color'")
         num_sets = num_decoder_sets(impostor.decoders)
-        rows = samples.rays * num_sets + impostor.decoder_index[tets]
+        rows = impostor.decoder_index[tets] * num_rays + samples.rays  # neighbours use the same decoders
         sigmas = sample_densities(impostor, tets, point_features, num_used)
         weights = optical_weights(sigmas, samples)
         values = jnp.column_stack([point_features, jnp.ones_like(weights), samples.t])
         sums = sum_by_ray(weights, values, rows, num_rays * num_sets, num_used)
-        directions = jnp.repeat(rays.directions, num_sets, axis=0)
+        directions = jnp.tile(rays.directions, (num_sets, 1))
         if turns is not None:
             seen = map_used(_directions_of, views, (samples.rays, mesh_tets), num_used)
             directions = _unit(sum_by_ray(weights, seen, rows, num_rays * num_sets, num_used), directions)
@@ -160,7 +160,7 @@ def ray_output(
 
 
 def decode_integrated(
-    decoders: Parameters, sums: Float[Array, "R*D C+2"], directions: Float[Array, "R*D E"]
+    decoders: Parameters, sums: Float[Array, "D*R C+2"], directions: Float[Array, "D*R E"]
 ) -> Float[Array, "R 5"]:
     """Colours, opacity and depth of rays, from sums by weight for each of D decoder sets (Eq. 10).
 
@@ -171,10 +171,10 @@ def decode_integrated(
     visible = weights > 0
     mean = jnp.where(visible, 1 / jnp.where(visible, weights, 1), 0)[:, None] * sums[:, :-2]
     num_sets, count = num_decoder_sets(decoders), directions.shape[0]
-    sets = jnp.arange(count, dtype=jnp.int32) % num_sets
+    sets = jnp.arange(count, dtype=jnp.int32) // max(count // num_sets, 1)
     colors = map_used(_decode_mean, decoders, (mean, directions, sets), jnp.int32(count))
     values = jnp.column_stack([weights[:, None] * colors, sums[:, -2:]])
-    return jnp.sum(values.reshape(-1, num_sets, 5), axis=1)
+    return jnp.sum(values.reshape(num_sets, count // num_sets, 5), axis=0)
 
 
 def _decode_mean(decoders: Parameters, part: tuple) -> Float[Array, "chunk 3"]:
