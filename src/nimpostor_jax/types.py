@@ -75,7 +75,7 @@ class TetSegments:
     lambda_enter: Float[Array, "N 4"]
     lambda_exit: Float[Array, "N 4"]
     overflow: Bool[Array, " R"]  # more tets or entries than slots: the tail is missing
-    disordered: Bool[Array, ""]  # some ray's segments overlap, or go back
+    disordered: Bool[Array, " R"]  # the ray's segments overlap, or go back
     mesh_tets: Int[Array, " N"] | None = None  # the mesh's tets, where `tet_ids` are a field's cells
 
 

@@ -68,7 +68,6 @@ def segments_of(*rays, slots=4):
                 enter[r, k], exit_[r, k] = low, high
                 lambdas[0, r, k, 0] = lambdas[1, r, k, 1] = 1
     return TetSegments(
-        disordered=jnp.asarray(False),
         rays=jnp.repeat(jnp.arange(len(rays), dtype=jnp.int32), slots),
         tet_ids=jnp.asarray(ids.ravel(), jnp.int32),
         t_enter=jnp.asarray(enter.ravel(), jnp.float32),
@@ -76,6 +75,7 @@ def segments_of(*rays, slots=4):
         lambda_enter=jnp.asarray(lambdas[0].reshape(-1, 4), jnp.float32),
         lambda_exit=jnp.asarray(lambdas[1].reshape(-1, 4), jnp.float32),
         overflow=jnp.zeros(len(rays), bool),
+        disordered=jnp.zeros(len(rays), bool),
     )
 
 

@@ -7,15 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from meshes import MESHES, local_vertices
+from meshes import local_vertices
 from numpy.testing import assert_allclose
 from rays import as_rays, generic
 from scenes import RENDER, exact
 
-from nimpostor_jax.geometry.subdivide import subdivide
-from nimpostor_jax.geometry.topology import build_tet_mesh
+from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.render.renderer import render_rays
-from nimpostor_jax.train.bake import FineCage, Moments, gather_by_tet, solve_moments
+from nimpostor_jax.train.bake import Moments, gather_by_tet, solve_moments
 from nimpostor_jax.train.step import RayBatch
 
 COUNT = 32
@@ -25,12 +24,7 @@ COUNT = 32
 def test_what_tets_gather_adds_up_to_the_picture(times, x64):
     """On a cage as coarse as the field's, or finer: samples stay where they are, only sums are cut."""
     impostor = scenes.impostor("blobs", "float64")
-    fine = subdivide(*MESHES["blobs"](), times)
-    cage = FineCage(
-        mesh=build_tet_mesh(fine.vertices, fine.tets, dtype="float64"),
-        parents=jnp.asarray(fine.parents, jnp.int32),
-        lambdas=jnp.asarray(fine.lambdas),
-    )
+    fine = subdivide(impostor, times)
     march = dataclasses.replace(RENDER.march, max_tets_per_ray=64, max_entries_per_ray=4)
     config = dataclasses.replace(exact(max_samples_per_ray=64, min_weight=1e-12), march=march)
     origins, directions = generic(*local_vertices(impostor.mesh), np.random.default_rng(3), COUNT)
@@ -38,7 +32,7 @@ def test_what_tets_gather_adds_up_to_the_picture(times, x64):
     rays = as_rays((center + scale * origins, directions), "float64")
     jitter = jnp.linspace(0, 0.99, COUNT)
     batch = RayBatch(rays=rays, target=jnp.zeros((COUNT, 4)), background=jnp.zeros((COUNT, 3)), jitter=jitter)
-    found = jax.jit(gather_by_tet, static_argnames="config")(impostor, cage, batch, config=config)
+    found = jax.jit(gather_by_tet, static_argnames="config")(fine, batch, config=config)
     output = jax.jit(render_rays, static_argnames="config")(impostor, rays, config, jitter)
     segments = found.segments
     lengths = segments.t_exit - segments.t_enter

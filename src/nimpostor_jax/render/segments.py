@@ -68,11 +68,17 @@ def locate_segments(
         lambda_enter=jnp.where(used[:, None], lambda_enter + skipped * (lambda_exit - lambda_enter), 0),
         lambda_exit=jnp.where(used[:, None], lambda_exit, 0),
         overflow=packed.overflow,
-        # Walks come in the order of their entries, each without gaps: overlap shows between neighbours.
-        disordered=jnp.any(
-            (codes[1:] >= 0) & (owners[1:] == owners[:-1]) & (t_enter[1:] < t_exit[:-1] - rounding[1:])
-        ),
+        disordered=_disordered(packed, t_enter, t_exit, rounding),
     )
+
+
+def _disordered(
+    packed: "_Packed", t_enter: Float[Array, " N"], t_exit: Float[Array, " N"], rounding: Float[Array, " N"]
+) -> Bool[Array, " R"]:
+    """Walks come in the order of their entries, each without gaps: overlap shows between neighbours."""
+    rays, ordered = packed.rays, jnp.zeros_like(packed.overflow)
+    back = (packed.codes[1:] >= 0) & (rays[1:] == rays[:-1]) & (t_enter[1:] < t_exit[:-1] - rounding[1:])
+    return jax.lax.cond(jnp.any(back), lambda: ordered.at[rays[1:]].max(back), lambda: ordered)
 
 
 def march_segments(

@@ -100,7 +100,7 @@ def in_order(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""
         rays = jnp.where(order < num_used, rays, jnp.iinfo(rays.dtype).max)
         return jax.lax.sort((rays, t, chosen), num_keys=2)[2]  # stable: of equals, the first walk's
 
-    return jax.lax.cond(frozen.segments.disordered, sort, lambda: chosen)
+    return jax.lax.cond(jnp.any(frozen.segments.disordered), sort, lambda: chosen)
 
 
 def _t_and_ray(plan: SamplePlan, items: tuple) -> tuple[Float[Array, " chunk"], Int[Array, " chunk"]]:
