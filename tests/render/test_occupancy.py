@@ -16,6 +16,7 @@ from nimpostor_jax.render.occupancy import (
     cell_index,
     cell_resolution,
     cells_of,
+    finer_cells,
     in_occupied_cells,
     num_cells,
     random_points,
@@ -113,3 +114,15 @@ def test_random_points_lie_in_their_cells():
     assert_array_equal(cell_index(tets, lambdas, cells), wanted)
     np.testing.assert_allclose(np.sum(lambdas, axis=1), 1, atol=1e-6)
     assert np.min(lambdas) >= 0
+
+
+@pytest.mark.parametrize("coarse, fine", [(4, 8), (4, 4), (2, 6), (3, 4)])
+def test_finer_cells_are_as_the_ones_around_them(coarse, fine, rng):
+    occupied = jnp.asarray(rng.uniform(size=(3, num_cells(coarse))) < 0.5)
+    lambdas = jnp.asarray(rng.dirichlet(np.ones(4), 3000), jnp.float32)
+    tets = jnp.asarray(rng.integers(0, 3, 3000), jnp.int32)
+    before = np.asarray(in_occupied_cells(occupied, tets, lambdas))
+    after = np.asarray(in_occupied_cells(finer_cells(occupied, num_cells(fine)), tets, lambdas))
+    assert np.all(after[before])  # nothing that was seen is lost
+    # A cell beside the face lambda_3 = 0 stands for the corner that the face cuts off.
+    assert np.mean(after != before) < 0.02 if fine % coarse == 0 else after.all()

@@ -31,7 +31,11 @@ COARSE_CELLS = 64  # a side, of the grid on which tets are told apart
 def union(
     a: NeuralImpostor, b: NeuralImpostor, *, color: Choice = "blend", threshold: float = THRESHOLD
 ) -> NeuralImpostor:
-    """What either fills. Where both do, the field is the first's, the second's, or both, by density."""
+    """What either fills. Where both do, the field is the first's, the second's, or both, by density.
+
+    `threshold`, in all of these: the optical depth of a step above which a point counts as filled. Raises
+    ValueError for another choice, a threshold below 0, and as `compose.compose`.
+    """
     _check_choice(color)
     if color == "first":
         b = gated(b, solid_of(a, threshold), keep_inside=False)
@@ -47,7 +51,10 @@ def intersection(
     color: Choice = "first",
     threshold: float = THRESHOLD,
 ) -> NeuralImpostor:
-    """What both fill, with the first's field, the second's, or both, by density (of impostors only)."""
+    """What both fill, with the first's field, the second's, or both, by density (of impostors only).
+
+    Raises ValueError as `union`, and for a pattern (a solid) where its field is asked for: it has none.
+    """
     _check_choice(color)
     if not isinstance(b, NeuralImpostor):
         if color != "first":
@@ -63,7 +70,7 @@ def intersection(
 def difference(
     a: NeuralImpostor, b: NeuralImpostor | Solid, *, threshold: float = THRESHOLD
 ) -> NeuralImpostor:
-    """What the first fills and the second does not."""
+    """What the first fills and the second, an impostor or a pattern, does not. Errors as in `union`."""
     solid = solid_of(b, threshold) if isinstance(b, NeuralImpostor) else b
     return gated(a, solid, keep_inside=False)
 
@@ -71,7 +78,7 @@ def difference(
 def symmetric_difference(
     a: NeuralImpostor, b: NeuralImpostor, *, threshold: float = THRESHOLD
 ) -> NeuralImpostor:
-    """What one fills and the other does not."""
+    """What one fills and the other does not. Errors as in `union`."""
     return compose([difference(a, b, threshold=threshold), difference(b, a, threshold=threshold)])
 
 

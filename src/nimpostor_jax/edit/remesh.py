@@ -47,8 +47,11 @@ def transfer(
     """The old impostor, as it stands, in a new cage of world-space vertices and positively oriented tets.
 
     New tets within an old one (kept or cut ones) go on in its field, exactly; the others get tables and
-    decoders of their own and two-stage retraining. Raises ValueError for a bad mesh, cages that do not
-    overlap, or where more than `config.max_lost_share` of what the old field shows lies outside the new cage.
+    decoders of their own and two-stage retraining. `render` is that of training.
+
+    Raises:
+        ValueError: a bad mesh, live operations or several objects in the impostor, cages that do not overlap,
+            or more than `config.max_lost_share` of what the old field shows outside of the new cage.
     """
     if old.gates or old.paints:
         raise ValueError("consolidate live operations (gates, paints) before the impostor is remeshed")

@@ -48,6 +48,7 @@ FEATURE_WEIGHT = 0.1  # of features, where opacities and colours count 1
 EMPTY_SHARE = 0.1  # of the points in occupied parts, as many in others of the same volume
 START_BATCHES = 16  # of points, for the first guess of tables
 OCCUPANCY_POINTS = 16  # in each part of a new cell, to find out what is occupied
+INWARD = 1e-3  # of the way to the tet's middle
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
 SYNC_EVERY = 8  # steps that may be under way at once
@@ -286,6 +287,7 @@ def _occupied_at(
     """Whether the old impostor is occupied at a random point of each part, numbered over the region."""
     assert new.occupied is not None and old.occupied is not None
     chosen, lambdas = random_points(key, parts, new.occupied.shape[1])
+    lambdas += INWARD * (0.25 - lambdas)  # many lie on faces, where the tet beyond would be found
     tets, cells, places = _in_old(old, source, new, region, chosen, lambdas.astype(new.mesh.vertices.dtype))
     held = jnp.maximum(tets, 0)
     return (tets >= 0) & in_occupied_cells(old.occupied, cells, places) & is_kept(old, held, places)
