@@ -20,7 +20,8 @@ import numpy as np
 from nimpostor_jax import metrics
 from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.edit.cage_fit import fit_cage, make_handles
-from nimpostor_jax.edit.deform import deform, deformation_report
+from nimpostor_jax.edit.deform import SpaceMap, deform, deformation_report
+from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import world_vertices
 from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
@@ -50,6 +51,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--views", type=int, help="how many of the views, spread evenly; default: all")
     parser.add_argument("--frames", type=int, default=24, help="of the animation")
     parser.add_argument("--handles", type=int, help="also: move only so many vertices, the others follow")
+    parser.add_argument("--subdivide", type=int, help="also: cut the cage into eight, up to so many times")
     parser.add_argument("--ray_bending", type=Path, help="workdir of a Cartesian field: the baseline's row")
     parser.add_argument("--ray_bending_views", type=int, default=1, help="it takes minutes a view")
     parser.add_argument("--quick", action="store_true", help="small and short, to try the script")
@@ -58,7 +60,7 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     if args.quick:
         vars(args).update(QUICK)
-    for name in ("views", "frames", "handles", "ray_bending_views"):
+    for name in ("views", "frames", "handles", "subdivide", "ray_bending_views"):
         if getattr(args, name) is not None and getattr(args, name) < 1:
             raise ValueError(f"--{name} must be >= 1, got {getattr(args, name)}")
     if args.resolution is not None:
@@ -105,6 +107,8 @@ def main(argv: Sequence[str]) -> None:
         print(f"{args.handles} handles: {result['handles']}")
         scores = evaluate(fitted, truth, config.render, pictures=out / "edit" / "handles", **shared)
         result["handles"] |= {f"{key}_deformed": scores[key] for key in ("psnr", "ssim")}
+    if args.subdivide is not None:
+        result["finer_cages"] = finer_cages(impostor, space_map, truth, args.subdivide, config)
     if cartesian is not None:
         views = spread(truth, args.ray_bending_views)
         result["ray_bending"] = ray_bending(cartesian, impostor, moved, views, out / "edit", config)
@@ -148,15 +152,47 @@ def spread(views: PosedImages, count: int | None) -> PosedImages:
 
 def unmoved(impostor: NeuralImpostor, truth: PosedImages, config: ExperimentConfig) -> list[float]:
     """PSNR of the object at rest to the deformed truth, by view: what doing nothing would score."""
-    sized = frame_config(impostor, camera_of(truth, 0), config.render)
-    background = 1.0 if config.data.background == "white" else 0.0
-    return [
-        metrics.psnr(
-            to_image(render_frame(impostor, camera_of(truth, i), sized), background),
-            composite(truth.images[i], config.data.background),
-        )
-        for i in range(len(truth))
-    ]
+    pairs = zip(pictures_of(impostor, truth, config), truth_of(truth, config), strict=True)
+    return [metrics.psnr(*pair) for pair in pairs]
+
+
+def pictures_of(
+    impostor: NeuralImpostor, views: PosedImages, config: ExperimentConfig
+) -> list[np.ndarray]:
+    """What the impostor shows in each view, over the config's background."""
+    sized = frame_config(impostor, camera_of(views, 0), config.render)
+    behind = 1.0 if config.data.background == "white" else 0.0
+    frames = (render_frame(impostor, camera_of(views, i), sized) for i in range(len(views)))
+    return [to_image(frame, behind) for frame in frames]
+
+
+def truth_of(views: PosedImages, config: ExperimentConfig) -> list[np.ndarray]:
+    """The views' pictures over the config's background."""
+    return [composite(image, config.data.background) for image in views.images]
+
+
+def finer_cages(
+    impostor: NeuralImpostor,
+    space_map: SpaceMap,
+    truth: PosedImages,
+    times: int,
+    config: ExperimentConfig,
+) -> list[dict[str, Any]]:
+    """The same field moved by finer and finer cages: PSNR to the truth, and to what the finest shows."""
+    rows, pictures = [], []
+    for n in range(times + 1):
+        moved = deform(subdivide(impostor, n), space_map)
+        pictures.append(pictures_of(moved, truth, config))
+        pairs = zip(pictures[-1], truth_of(truth, config), strict=True)
+        scores = [metrics.psnr(*pair) for pair in pairs]
+        report = deformation_report(moved)
+        rows.append({"tets": report.num_tets, "inverted_tets": report.num_inverted})
+        rows[-1]["psnr_deformed"] = np.mean(scores)
+        print(f"{report.num_tets} tets: {np.mean(scores):.2f} dB deformed")
+    for row, images in zip(rows[:-1], pictures[:-1], strict=True):
+        pairs = zip(images, pictures[-1], strict=True)
+        row["psnr_to_finest"] = np.mean([metrics.psnr(*pair) for pair in pairs])
+    return [{name: float(value) for name, value in row.items()} for row in rows]
 
 
 def by_handles(

@@ -147,7 +147,7 @@ def levers(base: RenderConfig) -> list[tuple[str, Any, RenderConfig]]:
     default = base.sampler.step / base.frame_refinement
     settings: list[tuple[str, Any, RenderConfig]] = [("default", default, base)]
     many = {"max_samples_per_ray": 1024}  # no ray is coarsened
-    for step in (0.5, 0.25, 0.125, 0.0625):
+    for step in (1 / 2, 1 / 4, 1 / 8, 1 / 12, 1 / 16):
         settings.append(("step", step, sampler(step=step, **many)))
     for steps in (2, 4, 8):
         settings.append(("alpha", 1 / steps, sampler(measure="alpha", step=1 / steps, **many)))

@@ -1,4 +1,4 @@
-"""edit.remesh, edit.retrain, edit.region: what fits is kept, the rest is trained, nothing else changes."""
+"""edit.remesh and what it is made of: what fits is kept, the rest is trained, nothing else changes."""
 
 import dataclasses
 
@@ -14,9 +14,9 @@ from scipy.spatial.transform import Rotation
 from nimpostor_jax.config import RetrainConfig
 from nimpostor_jax.edit.boolean import gated, union
 from nimpostor_jax.edit.deform import deform, rigid, stretch
+from nimpostor_jax.edit.probe import draw_points, occupancy_of
 from nimpostor_jax.edit.region import Region, trained_part, with_region, with_trained_part
 from nimpostor_jax.edit.remesh import consolidate, overlay, transfer
-from nimpostor_jax.edit.retrain import draw_points, occupancy_of
 from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.geometry.locate import locate_tables
 from nimpostor_jax.geometry.topology import world_vertices

@@ -104,7 +104,7 @@ def _own_entries(
 def _occupied(
     occupied: Bool[Array, "C parts"] | None, num_new: int, alone: bool
 ) -> Bool[Array, "cells parts"] | None:
-    """New cells may hold something anywhere, until `retrain.occupancy_of` says where."""
+    """New cells may hold something anywhere, until `probe.occupancy_of` says where."""
     if occupied is None:
         return None
     new = jnp.ones((num_new, occupied.shape[1]), bool)

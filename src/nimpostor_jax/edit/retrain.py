@@ -17,23 +17,24 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Bool, Float, Int
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
+from jaxtyping import Array, Float
 from tqdm.auto import tqdm
 
 from nimpostor_jax.config import RenderConfig, RetrainConfig
 from nimpostor_jax.edit.boolean import STEP
+from nimpostor_jax.edit.probe import Points, draw_points, occupancy_of
 from nimpostor_jax.edit.region import Region, trained_part, with_trained_part
 from nimpostor_jax.edit.teacher import pictures_of
 from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.field import impostor as field
-from nimpostor_jax.field.solids import is_kept, painted, to_cells
-from nimpostor_jax.geometry.locate import LocateTables, locate, locate_tables
-from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
+from nimpostor_jax.field.solids import to_cells
+from nimpostor_jax.geometry.locate import LocateTables, locate_tables
 from nimpostor_jax.render.capacity import fit_capacities
-from nimpostor_jax.render.occupancy import in_occupied_cells, random_points
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import draw_batch
-from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.sharding import AXIS, data_parallel, device_mesh, over_rays, replicated
 from nimpostor_jax.train.step import (
     Metrics,
     Parameters,
@@ -42,29 +43,13 @@ from nimpostor_jax.train.step import (
     make_optimizer,
     trainable,
 )
-from nimpostor_jax.types import NeuralImpostor, TetMesh
+from nimpostor_jax.types import NeuralImpostor
 
 FEATURE_WEIGHT = 0.1  # of features, where opacities and colours count 1
-EMPTY_SHARE = 0.1  # of the points in occupied parts, as many in others of the same volume
 START_BATCHES = 16  # of points, for the first guess of tables
-OCCUPANCY_POINTS = 16  # in each part of a new cell, to find out what is occupied
-INWARD = 1e-3  # of the way to the tet's middle
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
 SYNC_EVERY = 8  # steps that may be under way at once
-
-
-@struct.dataclass
-class Points:
-    """Points in a region's tets, and what the old field has there."""
-
-    tets: Int[Array, " M"]  # of the new mesh
-    lambdas: Float[Array, "M 4"]
-    features: Float[Array, "M C"]  # 0 where there is no old field
-    densities: Float[Array, " M"]  # per unit of the new tets' barycentric measure
-    directions: Float[Array, "M 3"]  # from all sides
-    colors: Float[Array, "M 3"]  # seen from there
-    present: Bool[Array, " M"]  # in the old mesh, and let through by its gates
 
 
 @struct.dataclass
@@ -91,9 +76,8 @@ def retrain(
         return new
     key, optimizer = jax.random.key(config.seed), make_optimizer()
     source = locate_tables(old.mesh)
-    draw = jax.jit(
-        partial(draw_points, count=config.points_per_batch, measure=render.density_measure)
-    )
+    count = max(1, config.points_per_batch // jax.local_device_count())
+    draw = jax.jit(partial(draw_points, count=count, measure=render.density_measure))
     new = dataclasses.replace(new, occupied=occupancy_of(old, source, new, region, config))
     guess = (jnp.zeros_like(new.tables.features),) * 2
     for i in range(START_BATCHES):
@@ -106,17 +90,39 @@ def retrain(
     new = dataclasses.replace(new, tables=tables)
 
     state = RetrainState(part=(part := trained_part(new, region)), optimizer=optimizer.init(part))
-    first = jax.jit(partial(feature_step, optimizer=optimizer), donate_argnums=0)
     rates = {"features": config.feature_rate, "decoders": config.decoder_rate}
-    losses = []
-    for i in tqdm(range(config.feature_steps), desc="features", unit="step", disable=None):
-        points = draw(jax.random.fold_in(key, START_BATCHES + i), old, source, new, region)
-        state, loss = first(state, new, region, points, rates)
-        losses.append(loss)
+    state, losses = _feature_stage(old, source, new, region, draw, config, state, optimizer, rates)
     _log_stage(log, "features", losses)
     state, losses = _render_stage(old, new, region, render, config, state, optimizer, rates)
     _log_stage(log, "colours", losses)
     return with_trained_part(new, region, state.part)
+
+
+def _feature_stage(
+    old: NeuralImpostor,
+    source: LocateTables,
+    new: NeuralImpostor,
+    region: Region,
+    draw: Callable[..., Points],
+    config: RetrainConfig,
+    state: RetrainState,
+    optimizer: optax.GradientTransformation,
+    rates: dict[str, float],
+) -> tuple[RetrainState, list[Array]]:
+    """Stage 1; each local device draws points of its own."""
+    key, losses, devices = jax.random.key(config.seed), [], jax.local_devices()
+    mesh = device_mesh(devices)
+    fields = jax.device_put((old, source, new, region), replicated(mesh))
+    state = jax.device_put(state, replicated(mesh))
+    step = partial(feature_step, draw=draw, optimizer=optimizer, gradient=on_all_devices(mesh))
+    compiled = jax.jit(step, donate_argnums=0)
+    for i in tqdm(range(config.feature_steps), desc="features", unit="step", disable=None):
+        keys = jax.random.split(jax.random.fold_in(key, START_BATCHES + i), len(devices))
+        state, loss = compiled(state, *fields, jax.device_put(keys, over_rays(mesh)), rates)
+        losses.append(loss)
+        if i % SYNC_EVERY == 0:
+            jax.block_until_ready(loss)
+    return jax.device_put(state, devices[0]), losses
 
 
 def _render_stage(
@@ -157,84 +163,6 @@ def _render_stage(
     return jax.device_put(state, devices[0]), losses
 
 
-def draw_points(
-    key: Array,
-    old: NeuralImpostor,
-    source: LocateTables,
-    new: NeuralImpostor,
-    region: Region,
-    *,
-    count: int,
-    measure: str,
-) -> Points:
-    """Points in the region's tets, and what the old field has there (Eq. 12, stage 1).
-
-    Even over the volume; where occupancy is known, ten times as dense in occupied parts. `measure` is that of
-    densities: barycentric ones change with the size of tets.
-    """
-    point_key, side_key = jax.random.split(key)
-    mesh = new.mesh
-    chosen, lambdas = _random_places(point_key, new, region, count)
-    found, cells, places = _in_old(old, source, new, region, chosen, lambdas)
-    inside, tets = found >= 0, jnp.maximum(found, 0)
-    present = inside & is_kept(old, tets, places)
-    features = jnp.where(inside[:, None], field.features(old, cells, places), 0)
-    densities = field.density(old, cells, features)
-    if measure == "barycentric":
-        densities *= _size(mesh, region.tets[chosen]) / _cell_size(old, tets)
-    directions = _unit(jax.random.normal(side_key, (count, 3), lambdas.dtype))
-    colors = field.radiance(old, cells, features, field.encode_directions(old, directions))
-    return Points(
-        tets=region.tets[chosen],
-        lambdas=lambdas,
-        features=features,
-        densities=jnp.where(present, densities, 0),
-        directions=directions,
-        colors=painted(old.paints, tets, places, directions, colors),
-        present=present,
-    )
-
-
-def _size(mesh: TetMesh, tets: Int[Array, " M"]) -> Float[Array, " M"]:
-    """Edge of a cube of each tet's volume; of flat tets next to nothing, but not nothing."""
-    volumes = jnp.abs(signed_volumes(corners(mesh.vertices, mesh.tets[tets])))
-    return jnp.cbrt(jnp.maximum(volumes, jnp.finfo(volumes.dtype).tiny))
-
-
-def _cell_size(impostor: NeuralImpostor, tets: Int[Array, " M"]) -> Float[Array, " M"]:
-    """The size that the cells around tets have where these are."""
-    size = _size(impostor.mesh, tets)
-    if impostor.embedding is None:
-        return size
-    shares = jnp.abs(jnp.linalg.det(impostor.embedding.lambdas))
-    return size / jnp.cbrt(jnp.maximum(shares, jnp.finfo(shares.dtype).tiny))[tets]
-
-
-def _unit(vectors: Float[Array, "*batch 3"]) -> Float[Array, "*batch 3"]:
-    return vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
-
-
-def _random_places(
-    key: Array, new: NeuralImpostor, region: Region, count: int
-) -> tuple[Int[Array, " M"], Float[Array, "M 4"]]:
-    """Which of the region's tets, and where in it."""
-    choice_key, place_key = jax.random.split(key)
-    volumes = jnp.maximum(signed_volumes(corners(new.mesh.vertices, new.mesh.tets[region.tets])), 0)
-    if new.occupied is None:
-        chosen = jax.random.choice(choice_key, volumes.size, (count,), p=volumes / jnp.sum(volumes))
-        shares = jax.random.exponential(place_key, (count, 4), volumes.dtype)
-        return chosen, shares / jnp.sum(shares, axis=1, keepdims=True)
-    occupied = new.occupied[_cells_of_region(new, region)]
-    weights = (volumes[:, None] * jnp.where(occupied, 1.0, EMPTY_SHARE)).reshape(-1)
-    parts = jax.random.choice(choice_key, weights.size, (count,), p=weights / jnp.sum(weights))
-    chosen, lambdas = random_points(place_key, parts, occupied.shape[1])
-    return chosen, lambdas.astype(volumes.dtype)
-
-
-def _cells_of_region(new: NeuralImpostor, region: Region) -> Int[Array, " n"]:
-    return region.tets if new.embedding is None else new.embedding.cells[region.tets]
-
-
 @jax.jit
 def _add_points(guess: tuple[Array, Array], new: NeuralImpostor, points: Points) -> tuple[Array, Array]:
     """Add up, by table entry, features times their weights, and weights: their ratio is a smoothed field."""
@@ -247,69 +175,6 @@ def _add_points(guess: tuple[Array, Array], new: NeuralImpostor, points: Points)
     _, pull = jax.vjp(encoded, new.tables.features)
     weight = jnp.broadcast_to(points.present[:, None], points.features.shape).astype(points.features.dtype)
     return guess[0] + pull(points.features * weight)[0], guess[1] + pull(weight)[0]
-
-
-def occupancy_of(
-    old: NeuralImpostor,
-    source: LocateTables,
-    new: NeuralImpostor,
-    region: Region,
-    config: RetrainConfig,
-) -> Bool[Array, "C parts"] | None:
-    """The new impostor's occupancy, with that of the old one in the region's cells. Host loop.
-
-    Every part of every cell is looked into at as many points: what is missed here is never rendered again.
-    """
-    if new.occupied is None or old.occupied is None:
-        return new.occupied
-    cells, num_parts = np.asarray(_cells_of_region(new, region)), new.occupied.shape[1]
-    everything = np.arange(len(cells) * num_parts)
-    found, batch = np.zeros(everything.size, bool), config.points_per_batch
-    look = jax.jit(_occupied_at)
-    key = jax.random.key(config.seed + 2)
-    for _ in range(OCCUPANCY_POINTS):
-        for start in range(0, everything.size, batch):
-            key, point_key = jax.random.split(key)
-            parts = np.resize(everything[start : start + batch], batch)
-            hits = np.asarray(look(point_key, old, source, new, region, jnp.asarray(parts, jnp.int32)))
-            found[parts] |= hits
-    return new.occupied.at[cells].set(jnp.asarray(found.reshape(len(cells), num_parts)))
-
-
-def _occupied_at(
-    key: Array,
-    old: NeuralImpostor,
-    source: LocateTables,
-    new: NeuralImpostor,
-    region: Region,
-    parts: Int[Array, " M"],
-) -> Bool[Array, " M"]:
-    """Whether the old impostor is occupied at a random point of each part, numbered over the region."""
-    assert new.occupied is not None and old.occupied is not None
-    chosen, lambdas = random_points(key, parts, new.occupied.shape[1])
-    lambdas += INWARD * (0.25 - lambdas)  # many lie on faces, where the tet beyond would be found
-    tets, cells, places = _in_old(old, source, new, region, chosen, lambdas.astype(new.mesh.vertices.dtype))
-    held = jnp.maximum(tets, 0)
-    return (tets >= 0) & in_occupied_cells(old.occupied, cells, places) & is_kept(old, held, places)
-
-
-def _in_old(
-    old: NeuralImpostor,
-    source: LocateTables,
-    new: NeuralImpostor,
-    region: Region,
-    chosen: Int[Array, " M"],
-    lambdas: Float[Array, "M 4"],
-) -> tuple[Int[Array, " M"], Int[Array, " M"], Float[Array, "M 4"]]:
-    """Points in the region's tets, by number, in the old mesh: tets (-1 outside), cells, coordinates."""
-    mesh = new.mesh
-    if region.sources is None:
-        positions = corners(mesh.vertices, mesh.tets[region.tets[chosen]])
-        world = mesh.center + mesh.scale * jnp.sum(lambdas[:, :, None] * positions, axis=1)
-        found, places = locate(old.mesh, world, source)
-    else:
-        found, places = region.sources[chosen], lambdas
-    return found, *to_cells(old.embedding, jnp.maximum(found, 0), places)
 
 
 def feature_loss(
@@ -331,17 +196,56 @@ def feature_loss(
     return jnp.mean(FEATURE_WEIGHT * off_features + jnp.abs(opacity - target) + off_colors)
 
 
-def feature_step(
-    state: RetrainState,
+def feature_gradient(
+    part: dict[str, Any],
+    old: NeuralImpostor,
+    source: LocateTables,
     new: NeuralImpostor,
     region: Region,
-    points: Points,
+    keys: Array,
+    *,
+    draw: Callable[..., Points],
+) -> tuple[dict[str, Any], Float[Array, ""]]:
+    """Gradient of `feature_loss` at the points that `draw` finds by the first of the keys, and the loss."""
+    points = draw(keys[0], old, source, new, region)
+    loss, gradients = jax.value_and_grad(feature_loss)(part, new, region, points)
+    return gradients, loss
+
+
+def on_all_devices(mesh: Mesh) -> Callable[..., tuple[dict[str, Any], Float[Array, ""]]]:
+    """`feature_gradient` with a key, and points, for each device of the mesh; the mean over them."""
+
+    def gradient(*arguments: Any, draw: Callable[..., Points]) -> tuple:
+        *shared, keys = arguments
+        specs = (P(),) * len(shared) + (P(AXIS),)
+
+        @partial(jax.shard_map, mesh=mesh, in_specs=specs, out_specs=P(), check_vma=False)
+        def shard(*arguments: Any) -> tuple:
+            return jax.lax.pmean(feature_gradient(*arguments, draw=draw), AXIS)
+
+        return shard(*shared, keys)
+
+    return gradient
+
+
+def feature_step(
+    state: RetrainState,
+    old: NeuralImpostor,
+    source: LocateTables,
+    new: NeuralImpostor,
+    region: Region,
+    keys: Array,
     rates: dict[str, Any],
     *,
+    draw: Callable[..., Points],
     optimizer: optax.GradientTransformation,
+    gradient: Callable[..., tuple[dict[str, Any], Float[Array, ""]]] = feature_gradient,
 ) -> tuple[RetrainState, Float[Array, ""]]:
-    """One step of stage 1."""
-    loss, gradients = jax.value_and_grad(feature_loss)(state.part, new, region, points)
+    """One step of stage 1 at points that `draw` finds by `keys`.
+
+    That is one key, or one for each of the devices that `gradient` (`on_all_devices`) knows.
+    """
+    gradients, loss = gradient(state.part, old, source, new, region, keys, draw=draw)
     return _stepped(state, gradients, rates, optimizer), loss
 
 
