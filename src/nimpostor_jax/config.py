@@ -307,8 +307,7 @@ class BakeConfig:
 
     The cage's tets are first halved until their edges are about `tet_pixels` long in the training views: a
     texture blurs what lies deep behind its face. After the fit to what single tets show, `refine_steps` of
-    training improve the textures (and with `refine_decoders` the decoders) on whole pictures: the training
-    views, and `novel_views` that the impostor renders from between them.
+    training improve the textures (and with `refine_decoders` the decoders) on whole pictures.
     """
 
     tet_pixels: float = 20.0
@@ -317,7 +316,6 @@ class BakeConfig:
     min_opacity: float = 2e-3  # of a tet, on average over the light that reaches it; less is left out
     max_megabytes: int = 2048  # of textures; more is refused
     fit_rays: int = 2_000_000
-    novel_views: int = 200
     refine_steps: int = 500
     refine_decoders: bool = True
     learning_rate: float = 5e-3
@@ -329,7 +327,6 @@ class BakeConfig:
         _require(1 <= self.max_resolution <= 4096, self, "max_resolution", "in [1, 4096]")
         _require(self.max_megabytes >= 1, self, "max_megabytes", ">= 1")
         _require(self.fit_rays >= 1, self, "fit_rays", ">= 1")
-        _require(self.novel_views >= 0, self, "novel_views", ">= 0")
         _require(self.refine_steps >= 0, self, "refine_steps", ">= 0")
         _require(self.learning_rate > 0, self, "learning_rate", "> 0")
 

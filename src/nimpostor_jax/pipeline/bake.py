@@ -17,7 +17,6 @@ from nimpostor_jax.encoding.face_grid import NO_TEXELS, build_face_layout, num_t
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.geometry.topology import world_vertices
 from nimpostor_jax.io.blender import PosedImages
-from nimpostor_jax.pipeline.novel_views import with_novel_views
 from nimpostor_jax.pipeline.prepare import Log, Scene
 from nimpostor_jax.render.baked import BASIS
 from nimpostor_jax.render.capacity import fit_capacities
@@ -48,19 +47,22 @@ RATES = {"depths": 1.0, "textures": 1.0, "decoders": 0.2}  # shares of it
 def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log = print) -> BakedImpostor:
     """The impostor with what its tets show baked onto their faces; best trained with early integration.
 
-    Halves the cage's tets, leaves out those in which nothing is seen, fits textures to what rays gather in
-    each of the others, and refines them on whole pictures: the training views, and what the impostor shows
-    from between them. Raises ValueError where the textures would need more than `max_megabytes`, or faces
-    have no area.
+    Halves the cage's tets, leaves out those in which nothing is seen, fits textures to what training rays
+    gather in each of the others, and refines them on the training views. Raises ValueError where the textures
+    would need more than `max_megabytes`, or faces have no area.
     """
     if impostor.gates or impostor.paints:
         raise ValueError("consolidate live operations (gates, paints) before the impostor is baked")
-    train = scene.config.train
-    views = with_novel_views(scene.train, impostor, config.novel_views, scene.config.render, train.seed)
     impostor = fine_impostor(impostor, scene.train, config)
-    mesh = impostor.mesh
+    train, mesh = scene.config.train, impostor.mesh
     pixels = face_pixels(world_vertices(mesh), np.asarray(mesh.tets), scene.train)
-    pool, _ = build_pool(mesh, views.cameras, views.images, scene.config.render.march, views.backgrounds)
+    pool, _ = build_pool(
+        mesh,
+        scene.train.cameras,
+        scene.train.images,
+        scene.config.render.march,
+        scene.train.backgrounds,
+    )
     key = jax.random.key(train.seed + 2)
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
     render = fit_config(mesh, pool, probe, scene.config.render)
