@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.edit.compose import compose, object_tets
-from nimpostor_jax.edit.deform import deform
+from nimpostor_jax.edit.deform import deform, deformation_report
+from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.impostor import init_impostor
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
@@ -201,3 +202,15 @@ def test_configs_that_cannot_be_mixed_are_named():
     other = dataclasses.replace(made, config=dataclasses.replace(made.config, decoder=decoder))
     with pytest.raises(ValueError, match="decoder sh_degree"):
         compose([made, other])
+
+
+def test_inverted_tets_of_a_deformation_go_on_as_they_are():
+    """They are the deformation's: what is made of its result neither refuses nor mends them."""
+    made = scenes.impostor("delaunay")
+    chosen = np.bincount(np.asarray(made.mesh.tets).reshape(-1)).argmax()
+    pushed = deform(made, lambda points: points.at[chosen].add(2.0))
+    count = deformation_report(pushed).num_inverted
+    assert count > 0
+    whole = compose([pushed, scenes.impostor("cube")])
+    assert deformation_report(whole).num_inverted == count
+    assert deformation_report(subdivide(pushed)).num_inverted == 8 * count

@@ -97,7 +97,7 @@ def solid_of(impostor: NeuralImpostor, threshold: float = THRESHOLD) -> Impostor
     objects = []
     for chosen in ids:
         used, inverse = np.unique(tets[chosen], return_inverse=True)
-        objects.append(build_in_frame(mesh, vertices[used], inverse.reshape(-1, 4)))
+        objects.append(build_in_frame(mesh, vertices[used], inverse.reshape(-1, 4), deformed=True))
     return ImpostorSolid(
         impostor=impostor,
         objects=tuple(objects),

@@ -112,6 +112,7 @@ def consolidate(
         np.asarray(mesh.vertices)[used],
         inverse.reshape(-1, 4),
         np.asarray(mesh.object_ids)[shown],
+        deformed=True,
     )
     old_cells = _cells(live, np.flatnonzero(shown))
     places = np.broadcast_to(np.eye(4), (shown.sum(), 4, 4))

@@ -24,8 +24,7 @@ def subdivide(
     """The impostor with the tets in a region of its mesh (None: all) cut into eight, `times` times.
 
     Neighbours of the region are cut where they must be for faces to match; all other tets, and the field
-    everywhere, stay as they are. Host code. Raises ValueError for `times` < 0, a region of another shape, and
-    inverted or flat tets.
+    everywhere, stay as they are. Host code. Raises ValueError for `times` < 0 and a region of another shape.
     """
     if times < 0:
         raise ValueError(f"times must be >= 0, got {times}")
@@ -38,7 +37,7 @@ def subdivide(
         rest = jnp.asarray(fine.vertices_of(np.asarray(rest), tets))
     return dataclasses.replace(
         impostor,
-        mesh=build_in_frame(mesh, fine.vertices, fine.tets, object_ids),
+        mesh=build_in_frame(mesh, fine.vertices, fine.tets, object_ids, deformed=True),
         embedding=_within(impostor.embedding, fine, mesh.vertices.dtype.name),
         rest_vertices=rest,
         gates=tuple(_by_parent(gate, fine.parents) for gate in impostor.gates),

@@ -76,8 +76,8 @@ def subdivide(
 ) -> Subdivision:
     """Halve every edge of the tets in a region (None: of all), `times` times, and what it takes to conform.
 
-    8**times tets for each in the region. Positively oriented tets stay so. Raises ValueError where the region
-    is not one flag for each tet.
+    8**times tets for each in the region. Children are oriented as their parents. Raises ValueError where the
+    region is not one flag for each tet.
     """
     if region is not None and np.shape(region) != (len(tets),):
         raise ValueError(f"the region must flag each of {len(tets)} tets, got shape {np.shape(region)}")
@@ -123,10 +123,8 @@ def _halve(mesh: Subdivision, chosen: Bool[np.ndarray, " T"]) -> Subdivision:
         owners = np.repeat(rows, children.shape[1])
         parts.append((points[at, children].reshape(-1, 4), lambdas[at, children].reshape(-1, 4, 4), owners))
     tets, lambdas, owners = (np.concatenate(part) for part in zip(*parts, strict=True))
-    corners = vertices[tets]
-    inverted = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
-    inverted &= pattern[owners] > 0  # whole tets stay as they are
-    swapped = np.where(inverted[:, None], [0, 1, 3, 2], [0, 1, 2, 3])
+    # As their parents are turned, also where a deformation has inverted these.
+    swapped = np.where((np.linalg.det(lambdas) < 0)[:, None], [0, 1, 3, 2], [0, 1, 2, 3])
     return Subdivision(
         vertices=vertices,
         tets=np.take_along_axis(tets, swapped, axis=1).astype(np.int32),

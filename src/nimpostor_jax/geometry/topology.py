@@ -40,8 +40,12 @@ def build_tet_mesh(
     tets: Int[np.ndarray, "T 4"],
     object_ids: Int[np.ndarray, " T"] | None = None,
     dtype: str = "float32",
+    *,
+    deformed: bool = False,
 ) -> TetMesh:
     """A TetMesh from world-space vertices and positively oriented tets.
+
+    A `deformed` mesh, of which the tets have been positively oriented once, may have inverted and flat ones.
 
     The mesh is stored relative to the centre of its bounding box and half the box's diagonal, computed in
     float64, so that float32 results depend neither on where the object stands nor on its size. Raises
@@ -69,7 +73,7 @@ def build_tet_mesh(
         raise ValueError(f"vertex {bad} is not finite: {vertices[bad]}")
     edges = vertices[tets[:, 1:]] - vertices[tets[:, :1]]
     inverted = np.flatnonzero(np.linalg.det(edges) <= 0)
-    if inverted.size:
+    if inverted.size and not deformed:
         raise ValueError(
             f"{inverted.size} of {len(tets)} tets are inverted or flat (first: {inverted[0]}); "
             "call preprocess.validate.orient_tets, or remove flat tets"
@@ -97,10 +101,12 @@ def build_in_frame(
     vertices: Float[np.ndarray, "V 3"],
     tets: Int[np.ndarray, "T 4"],
     object_ids: Int[np.ndarray, " T"] | None = None,
+    *,
+    deformed: bool = False,
 ) -> TetMesh:
     """`build_tet_mesh` of vertices in another mesh's frame, which stays: kept vertices keep their bits."""
     dtype = mesh.vertices.dtype
-    built = build_tet_mesh(vertices, tets, object_ids, dtype=dtype.name)
+    built = build_tet_mesh(vertices, tets, object_ids, dtype.name, deformed=deformed)
     placed = jnp.asarray(vertices, dtype)
     return dataclasses.replace(built, vertices=placed, center=mesh.center, scale=mesh.scale)
 
