@@ -168,6 +168,7 @@ def test_bad_input_ends_in_one_line(script, arguments, message, tmp_path):
 SCRIPTS = [
     "train", "evaluate", "render", "make_cage", "benchmark", "demo", "bake", "table2", "capture",
     "edit_deform", "edit_remesh", "edit_boolean", "edit_compose", "snowman",
+    "layouts", "compose_cost",
 ]  # fmt: skip
 
 

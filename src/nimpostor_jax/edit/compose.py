@@ -54,8 +54,9 @@ def compose(
     objects = [np.asarray(each.mesh.object_ids) for each in impostors]
     objects = _shifted(objects, [ids.max() + 1 for ids in objects])
     dtype = impostors[0].mesh.vertices.dtype.name
-    arrays = [np.concatenate(parts) for parts in (vertices, tets, objects)]
-    mesh = build_tet_mesh(arrays[0], arrays[1], arrays[2], dtype, deformed=True)
+    mesh = build_tet_mesh(
+        np.concatenate(vertices), np.concatenate(tets), np.concatenate(objects), dtype, deformed=True
+    )
 
     features, layout = _joined_tables(impostors)
     num_tets = [each.mesh.tets.shape[0] for each in impostors]

@@ -76,12 +76,12 @@ def retrain(
         return new
     key, optimizer = jax.random.key(config.seed), make_optimizer()
     source = locate_tables(old.mesh)
-    count = max(1, config.points_per_batch // jax.local_device_count())
-    draw = jax.jit(partial(draw_points, count=count, measure=render.density_measure))
+    draw = jax.jit(partial(draw_points, measure=render.density_measure), static_argnames="count")
     new = dataclasses.replace(new, occupied=occupancy_of(old, source, new, region, config))
     guess = (jnp.zeros_like(new.tables.features),) * 2
     for i in range(START_BATCHES):
-        guess = _add_points(guess, new, draw(jax.random.fold_in(key, i), old, source, new, region))
+        points = draw(jax.random.fold_in(key, i), old, source, new, region, count=config.points_per_batch)
+        guess = _add_points(guess, new, points)
     sums, weights = guess
     mean = sums / jnp.where(weights > 0, weights, 1)
     tables = dataclasses.replace(
@@ -114,6 +114,7 @@ def _feature_stage(
     mesh = device_mesh(devices)
     fields = jax.device_put((old, source, new, region), replicated(mesh))
     state = jax.device_put(state, replicated(mesh))
+    draw = partial(draw, count=max(1, config.points_per_batch // len(devices)))
     step = partial(feature_step, draw=draw, optimizer=optimizer, gradient=on_all_devices(mesh))
     compiled = jax.jit(step, donate_argnums=0)
     for i in tqdm(range(config.feature_steps), desc="features", unit="step", disable=None):

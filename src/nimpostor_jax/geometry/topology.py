@@ -45,11 +45,10 @@ def build_tet_mesh(
 ) -> TetMesh:
     """A TetMesh from world-space vertices and positively oriented tets.
 
-    A `deformed` mesh, of which the tets have been positively oriented once, may have inverted and flat ones.
-
     The mesh is stored relative to the centre of its bounding box and half the box's diagonal, computed in
     float64, so that float32 results depend neither on where the object stands nor on its size. Raises
-    ValueError for shapes, indices, non-finite vertices, and inverted or flat tets (naming the first).
+    ValueError for shapes, indices, non-finite vertices, and (naming the first) inverted or flat tets, unless
+    the mesh is `deformed`: its tets were positively oriented once.
     """
     vertices = np.asarray(vertices, np.float64)
     tets = np.asarray(tets)
