@@ -37,7 +37,7 @@ from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.evaluate import camera_of, write_json
 from nimpostor_jax.pipeline.prepare import Scene, prepare, use_all_cores
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.frame import View, frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import View, for_frames, frame_config, render_frame, to_image
 from nimpostor_jax.render.sampling import plan_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
@@ -227,25 +227,27 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
     camera = first_camera(scene, size)
     full = scene.config.render
     everything = dataclasses.replace(full, skip_empty=False, min_weight=0.0)
+    merged = for_frames(impostor)
     settings = {
-        "": (full, False),
-        "_with_empty_cells": (dataclasses.replace(full, skip_empty=False), False),
-        "_with_invisible_samples": (dataclasses.replace(full, min_weight=0.0), False),
-        "_with_empty_pixels": (full, True),
-        "_with_everything": (everything, True),
+        "": (merged, full, False),
+        "_with_single_levels": (impostor, full, False),
+        "_with_empty_cells": (merged, dataclasses.replace(full, skip_empty=False), False),
+        "_with_invisible_samples": (merged, dataclasses.replace(full, min_weight=0.0), False),
+        "_with_empty_pixels": (merged, full, True),
+        "_with_everything": (impostor, everything, True),
     }
     calls, images, times = {}, {}, {}
     pixels = np.arange(camera.width * camera.height)
-    for name, (config, all_pixels) in settings.items():
-        config = frame_config(impostor, camera, config)
+    for name, (field, config, all_pixels) in settings.items():
+        config = frame_config(field, camera, config)
         if all_pixels:
-            calls[name] = lambda config=config: View(impostor, camera, config).render(pixels)
+            calls[name] = lambda field=field, config=config: View(field, camera, config).render(pixels)
         else:
-            calls[name] = partial(render_frame, impostor, camera, config)
+            calls[name] = partial(render_frame, field, camera, config)
         start = time.perf_counter()
         calls[name]()
         times[name] = [time.perf_counter() - start]
-        images[name] = to_image(render_frame(impostor, camera, config))
+        images[name] = to_image(render_frame(field, camera, config))
         print(f"frame{name}: {times[name][0]:.1f} s with compilation", flush=True)
     for _ in range(repeats):
         for name, call in calls.items():
@@ -257,7 +259,7 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
             "name": f"frame_{camera.width}x{camera.height}{name}",
             "ms": 1e3 * float(np.median(times[name][1:])),
             "compile_s": times[name][0] - float(np.median(times[name][1:])),
-            "psnr_to_exact": None if settings[name][0] is everything
+            "psnr_to_exact": None if settings[name][1] is everything
             else float(psnr(images[name], images["_with_everything"])),
         }
         for name in settings

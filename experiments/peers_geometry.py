@@ -31,7 +31,7 @@ from nimpostor_jax.preprocess.embree import EmbreeQuery, EmbreeSegments
 from nimpostor_jax.preprocess.validate import orient_tets
 from nimpostor_jax.render.camera import TILE, to_local
 from nimpostor_jax.render.capacity import fit_capacities
-from nimpostor_jax.render.frame import Frame, frame_config, render_frame
+from nimpostor_jax.render.frame import Frame, for_frames, frame_config, render_frame
 from nimpostor_jax.render.traverse import Crossings, march_tables, traverse
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays, TetMesh
 
@@ -262,6 +262,7 @@ def _against_vtk(impostor: NeuralImpostor, camera: Camera, config: RenderConfig)
     grid.point_data["scalar"] = np.linalg.norm(np.asarray(mesh.vertices), axis=1)  # 0 to 1
     grid.set_active_scalars("scalar")
     window = _vtk_window(vtk, grid, camera)
+    impostor = for_frames(impostor)
     sized = frame_config(impostor, camera, config)
 
     def peer() -> None:

@@ -20,7 +20,7 @@ from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.pipeline.evaluate import orbit
 from nimpostor_jax.pipeline.prepare import use_all_cores
-from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import for_frames, frame_config, render_frame, to_image
 
 
 def main(argv: Sequence[str]) -> None:
@@ -43,6 +43,7 @@ def main(argv: Sequence[str]) -> None:
     if args.deformation is not None:
         impostor = deform(impostor, load_deformation(args.deformation))
     train, _ = load_scene(resolve_scene(args.data), config.data)
+    impostor = for_frames(impostor)
     cameras = orbit(train, args.frames, size=args.size)
     sized = frame_config(impostor, cameras[0], config.render)
     background = 1.0 if config.data.background == "white" else 0.0

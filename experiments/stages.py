@@ -20,6 +20,7 @@ import numpy as np
 from benchmark import first_camera
 
 from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.field.impostor import merge_levels
 from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.pipeline.evaluate import write_json
@@ -58,7 +59,7 @@ def main(argv: Sequence[str]) -> None:
     order = tile_order(camera.height, camera.width)
     rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2)[order])
     sized = frame_config(impostor, camera, config.render)
-    rows = render_stages("frame", impostor, chunk_of_hits(impostor, rays, sized), sized, None)
+    rows = render_stages("frame", merge_levels(impostor), chunk_of_hits(impostor, rays, sized), sized, None)
     half = config.train.rays_per_batch // 2
     batch = draw_batch(jax.random.key(0), 0, scene.pool, half, "random")
     rows += render_stages("training", impostor, batch.rays, scene.render, batch.jitter)
@@ -113,7 +114,7 @@ def render_stages(
         "segments", lambda m, r, c: locate_segments(m, r, c, 0.0, capacity), mesh, local, crossings
     )
     plan = stage("plan", lambda s: plan_samples(s, config.sampler, config.density_measure, jitter), segments)
-    chosen, count = stage("cells", lambda i, p: present_samples(i, p, config), impostor, plan)
+    plan, chosen, count = stage("cells", lambda i, p: present_samples(i, p, config), impostor, plan)
     numbers = {"planned": int(plan.num_used), "in occupied cells": int(count)}
     chosen, features, count = stage(
         "visible", lambda i, p, c, n: visible_samples(i, p, c, n, config, None), impostor, plan, chosen, count

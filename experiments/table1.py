@@ -35,7 +35,7 @@ from nimpostor_jax.pipeline.evaluate import camera_of
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.pipeline.ray_bending import BentField
 from nimpostor_jax.render.camera import TILE
-from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import for_frames, frame_config, render_frame, to_image
 from nimpostor_jax.render.raster_frame import rasterize_frame
 from nimpostor_jax.types import Camera
 
@@ -81,8 +81,9 @@ def main(argv: Sequence[str]) -> None:
     frames: dict[str, Callable[[], np.ndarray]] = {}
     for name, method in (("volume", "BarySpl"), ("volume, early integration", "FeatInt")):
         each = trained[method]
-        config = frame_config(each.impostor, camera, each.scene.config.render)
-        frames[name] = lambda i=each.impostor, c=config: to_image(render_frame(i, camera, c))
+        ready = for_frames(each.impostor)
+        config = frame_config(ready, camera, each.scene.config.render)
+        frames[name] = lambda i=ready, c=config: to_image(render_frame(i, camera, c))
     sized = frame_config(baked, camera, trained["FeatInt"].scene.config.render)
     frames["baked, marched"] = lambda: to_image(render_frame(baked, camera, sized))
     frames["baked, rasterized"] = lambda: to_image(rasterize_frame(baked, camera, sized))

@@ -37,7 +37,7 @@ EXPERIMENTS = st.builds(
             layout=st.sampled_from(["per_simplex", "per_tet"]),
             interpolation=st.sampled_from(["grid", "simplex"]),
             num_levels=st.integers(1, 8),
-            growth=st.floats(1.0, 2.0),
+            growth=st.none() | st.floats(1.0, 2.0),
             log2_tet_table=st.none() | st.integers(1, 20),
         ),
         decoder=st.builds(DecoderConfig, sh_degree=st.integers(0, 4)),
@@ -58,7 +58,7 @@ EXPERIMENTS = st.builds(
         (EncodingConfig, "layout", "per_face"),
         (EncodingConfig, "interpolation", "cubic"),
         (EncodingConfig, "num_levels", 0),
-        (EncodingConfig, "num_levels", 14),  # 2**13 > 4096
+        (EncodingConfig, "num_levels", 26),  # 6144 > 4096
         (EncodingConfig, "features_per_level", 0),
         (EncodingConfig, "base_resolution", 0),
         (EncodingConfig, "growth", 0.99),
@@ -198,7 +198,9 @@ def test_table_size_never_grows_with_the_mesh(num_tets):
 
 
 def test_resolutions_and_feature_dim():
-    assert EncodingConfig(num_levels=4).resolutions == (1, 2, 4, 8)
+    assert EncodingConfig(num_levels=6).resolutions == (1, 2, 3, 4, 6, 8)
+    assert EncodingConfig(num_levels=4, base_resolution=5).resolutions == (5, 10, 15, 20)
+    assert EncodingConfig(num_levels=4, growth=2.0).resolutions == (1, 2, 4, 8)
     # round(2 * 1.5**l) = 2, 3, 4.5 -> 4 (to even), 6.75 -> 7
     encoding = EncodingConfig(num_levels=4, base_resolution=2, growth=1.5, features_per_level=3)
     assert encoding.resolutions == (2, 3, 4, 7)

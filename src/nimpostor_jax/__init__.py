@@ -50,7 +50,7 @@ _MODULES = {
     "geometry.topology": ("build_tet_mesh", "world_vertices"),
     "preprocess.patterns": ("solid_from_image", "solid_from_surface"),
     "render.camera": ("image_pixels", "pixel_rays"),
-    "render.frame": ("frame_config", "render_frame", "to_image"),
+    "render.frame": ("for_frames", "frame_config", "render_frame", "to_image"),
     "render.raster_frame": ("rasterize_frame",),
     "render.renderer": ("render_rays",),
     "train.step": ("train_step",),

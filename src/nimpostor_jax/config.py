@@ -29,14 +29,17 @@ class EncodingConfig:
     (continuous field), `per_tet` gives each tet its own table (the paper's). `interpolation` is the
     16-corner 4D `grid` of the paper or the 4-corner `simplex` of the edgewise subdivision. The layout `box`
     is Instant-NGP's grid of Cartesian coordinates in the cage's bounding cube, with 8 or 4 corners.
+
+    Resolutions are 1, 2, 3, 4, 6, 8, 12, ... times the base, each twice the one two levels before, or grow by
+    a constant factor (the paper's "progressively subdividing": 2).
     """
 
     layout: Layout = "per_simplex"
     interpolation: Interpolation = "simplex"
-    num_levels: int = 7  # at most: training leaves out levels with cells below half a pixel
+    num_levels: int = 14  # at most: training leaves out levels with cells below half a pixel
     features_per_level: int = 2
     base_resolution: int = 1
-    growth: float = 2.0
+    growth: float | None = None  # None: two levels an octave
     log2_table_size: int = 19  # H, the whole mesh's budget a level
     min_log2_tet_table: int = 8
     max_log2_tet_table: int = 11
@@ -61,7 +64,7 @@ class EncodingConfig:
         _require(self.num_levels >= 1, self, "num_levels", ">= 1")
         _require(self.features_per_level >= 1, self, "features_per_level", ">= 1")
         _require(self.base_resolution >= 1, self, "base_resolution", ">= 1")
-        _require(self.growth >= 1.0, self, "growth", ">= 1")
+        _require(self.growth is None or self.growth >= 1.0, self, "growth", "None or >= 1")
         _require(
             max(self.resolutions) <= 4096,
             self,
@@ -83,10 +86,11 @@ class EncodingConfig:
 
     @property
     def resolutions(self) -> tuple[int, ...]:
-        """Grid resolution N_l = round(base * growth**l) of each level."""
-        return tuple(
-            round(self.base_resolution * self.growth**level) for level in range(self.num_levels)
-        )
+        """Grid resolution N_l = round(base * growth**l) of each level, or two of them an octave."""
+        base, growth, levels = self.base_resolution, self.growth, range(self.num_levels)
+        if growth is not None:
+            return tuple(round(base * growth**level) for level in levels)
+        return tuple(base * (((2 + level % 2) << level // 2) // 2) for level in range(1, len(levels) + 1))
 
     @property
     def feature_dim(self) -> int:
@@ -156,6 +160,7 @@ class SamplerConfig:
     capacity_per_ray: int | None = (
         None  # mean samples a ray in the packed buffer; None: S, no packing
     )
+    occupied_per_ray: int | None = None  # of these, mean samples a ray in occupied cells; None: all
 
     def __post_init__(self) -> None:
         _require(
@@ -172,6 +177,12 @@ class SamplerConfig:
             self,
             "capacity_per_ray",
             "None or in [1, max_samples_per_ray]",
+        )
+        _require(
+            self.occupied_per_ray is None or self.occupied_per_ray >= 1,
+            self,
+            "occupied_per_ray",
+            "None or >= 1",
         )
 
 

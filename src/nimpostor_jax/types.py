@@ -123,6 +123,20 @@ class HashTables:
 
 
 @struct.dataclass
+class MergedTables:
+    """Chains of levels as one each, for rendering: features of all nodes of a chain's finest grid.
+
+    `encoding.merged` numbers the n nodes of a tet. A point's features are those of the first chain's levels,
+    of the second's, ..., and of the finer levels that are not merged.
+    """
+
+    nodes: tuple[Float[Array, "T*n C"], ...]
+    corner_order: Int[Array, "T 4"]  # in which the encoding takes a tet's corners
+    finer: HashTables | None  # all tables, for the levels that are not in chains
+    chains: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)  # levels
+
+
+@struct.dataclass
 class Embedding:
     """Where a mesh's tets lie in the cells of its field: the tets for which the field's tables were made.
 
@@ -183,7 +197,7 @@ class NeuralImpostor:
     """
 
     mesh: TetMesh
-    tables: HashTables
+    tables: HashTables  # `field.merge_levels` puts `MergedTables` here, for rendering only
     decoders: dict[str, Any]  # every leaf has a leading axis: the stack of decoder sets
     decoder_index: Int[Array, " T"]  # which decoder set a cell uses
     config: ImpostorConfig = struct.field(pytree_node=False)

@@ -117,7 +117,7 @@ def test_per_simplex_is_never_larger_than_per_tet(make, interpolation, log2):
     _, tets = make()
     sizes = {}
     for name in ("per_simplex", "per_tet"):
-        config = config_of(name, interpolation, num_levels=9, log2_tet_table=log2)
+        config = config_of(name, interpolation, num_levels=16, log2_tet_table=log2)
         sizes[name] = np.diff(build_layout(tets, config).starts)
     budget = len(tets) << log2
     assert max(sizes["per_simplex"]) <= budget
@@ -129,14 +129,14 @@ def test_hashed_levels_use_the_budget():
     """A limit that is respected by storing nothing would be worthless."""
     _, tets = nonconvex()
     entries = np.diff(
-        build_layout(tets, config_of("per_simplex", "grid", num_levels=8, log2_tet_table=8)).starts
+        build_layout(tets, config_of("per_simplex", "grid", num_levels=14, log2_tet_table=8)).starts
     )
     assert entries[-1] > 0.4 * (len(tets) << 8)  # sizes are powers of two
 
 
 def test_offsets_that_do_not_fit_their_integers_are_refused():
     _, tets = nonconvex()
-    config = config_of("per_tet", "grid", num_levels=8, log2_tet_table=20)
+    config = config_of("per_tet", "grid", num_levels=14, log2_tet_table=20)
     with pytest.raises(ValueError, match="entries"):
         build_layout(np.tile(tets, (3, 1)), config)
 

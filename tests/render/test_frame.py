@@ -11,12 +11,14 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rays import as_rays, generic, missing
 from scenes import RENDER, exact
 
+from nimpostor_jax import chunks
 from nimpostor_jax.config import MarchConfig, SamplerConfig
 from nimpostor_jax.render import capacity
 from nimpostor_jax.render import frame as frames
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
 from nimpostor_jax.render.capacity import fit_capacities, ray_entries
-from nimpostor_jax.render.frame import frame_config, refined, render_frame, to_image
+from nimpostor_jax.render.frame import for_frames, frame_config, refined, render_frame, to_image
+from nimpostor_jax.render.occupancy import num_cells
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.sampling import step_boundaries
 from nimpostor_jax.render.traverse import march_tables, traverse
@@ -71,6 +73,47 @@ def test_frames_have_finer_steps(scene):
     )
     check_equal(render_frame(impostor, camera, config), expected)
     check_equal(render_frame(impostor, camera, frame_config(impostor, camera, config)), expected)
+
+
+def test_merged_levels_give_the_same_frame(scene):
+    impostor, camera = scene
+    merged = for_frames(impostor)
+    assert merged.tables.chains == ((0, 1),)
+    check_equal(render_frame(merged, camera, RENDER), whole_image(impostor, camera, RENDER))
+    moved = jax.tree.map(lambda x: x, merged).replace(
+        mesh=merged.mesh.replace(vertices=1.1 * merged.mesh.vertices)
+    )
+    expected = impostor.replace(mesh=impostor.mesh.replace(vertices=1.1 * impostor.mesh.vertices))
+    check_equal(render_frame(moved, camera, RENDER), whole_image(expected, camera, RENDER))
+
+
+def partly_occupied(impostor, share):
+    parts = np.random.default_rng(0).random((len(impostor.mesh.tets), num_cells(4))) < share
+    return impostor.replace(occupied=jax.numpy.asarray(parts))
+
+
+def test_buffers_behind_the_occupancy_are_smaller(scene):
+    impostor, camera = partly_occupied(scene[0], 0.3), scene[1]
+    config = frame_config(impostor, camera, RENDER)
+    assert config.sampler.occupied_per_ray < config.sampler.capacity_per_ray
+    expected = whole_image(impostor, camera, RENDER)
+    check_equal(render_frame(impostor, camera, config), expected)
+    none = frame_config(impostor, camera, dataclasses.replace(RENDER, skip_empty=False))
+    assert none.sampler.occupied_per_ray is None
+
+
+def test_samples_that_do_not_fit_behind_the_occupancy_are_flagged(scene, monkeypatch):
+    """Rays without a flag are as they were, and frames render the others again."""
+    impostor, camera = partly_occupied(scene[0], 0.9), scene[1]
+    rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2))
+    monkeypatch.setattr(chunks, "CPU_CHUNK", 64)  # buffers are whole chunks
+    crowded = exact(occupied_per_ray=1)
+    expected, output = render(impostor, rays, RENDER), render(impostor, rays, crowded)
+    fits = ~np.asarray(output.overflow)
+    assert 0 < fits.sum() < fits.size
+    assert_array_equal(output.color[fits], expected.color[fits])
+    assert np.any(np.abs(output.color - expected.color)[~fits] > 1e-3)
+    check_equal(render_frame(impostor, camera, crowded), whole_image(impostor, camera, RENDER))
 
 
 def test_steps_that_grow_are_refined_all_along():

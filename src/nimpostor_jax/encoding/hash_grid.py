@@ -44,24 +44,28 @@ def encode(
     lambdas: Float[Array, "M 4"],
     num_used: Int[Array, ""] | int | None = None,
     known: Float[Array, "M L*F"] | None = None,
+    first_level: int = 0,
 ) -> Float[Array, "M L*F"]:
     """Features f_p of points given by tet and barycentric coordinates, all levels concatenated (Eq. 6).
 
     Differentiable in the tables and, between grid nodes, in the coordinates, in reverse mode. Where only the
     first `num_used` points matter, no more than their chunks are computed; the rest is 0. Where the features
-    are `known` from an earlier call, they are not computed again but given their derivatives.
+    are `known` from an earlier call, they are not computed again but given their derivatives. Features of
+    levels before `first_level` are left 0.
     """
     num_points = tet_ids.shape[0]
     chunk = default_chunk(num_points)
     used = jnp.asarray(num_points if num_used is None else num_used, jnp.int32)
     tet_ids, lambdas, known = pad_items((tet_ids, lambdas, known), chunk)
-    return _encode(config, chunk, tables.features, tables.layout, tet_ids, lambdas, used, known)[:num_points]
+    arguments = tables.features, tables.layout, tet_ids, lambdas, used, known
+    return _encode(config, chunk, first_level, *arguments)[:num_points]
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1, 2))
 def _encode(
     config: EncodingConfig,
     chunk: int,
+    first_level: int,
     features: Float[Array, "entries F"],
     layout: Layout,
     tet_ids: Int[Array, " M"],
@@ -89,19 +93,26 @@ def _encode(
         return for_chunks(num_used, chunk, encode_chunk, out)
 
     shape = (tet_ids.shape[0], config.num_levels, features.shape[1])
-    out = _for_levels(config, grid, add_level, jnp.zeros(shape, jnp.result_type(features, lambdas)))
+    zeros = jnp.zeros(shape, jnp.result_type(features, lambdas))
+    out = _for_levels(config, grid, first_level, add_level, zeros)
     return out.reshape(shape[0], -1)
 
 
-def _encode_forward(config: EncodingConfig, chunk: int, *primals: Any) -> tuple[Array, tuple]:
+def _encode_forward(
+    config: EncodingConfig, chunk: int, first_level: int, *primals: Any
+) -> tuple[Array, tuple]:
     """Keeps which gradients are asked for, as () or None: static, since an empty tuple holds no array."""
     arguments = jax.tree.map(lambda p: p.value, primals)
     wanted = tuple(() if primals[i].perturbed else None for i in (0, 3))
-    return _encode(config, chunk, *arguments), ((*arguments[:5], None), wanted)
+    return _encode(config, chunk, first_level, *arguments), ((*arguments[:5], None), wanted)
 
 
 def _encode_backward(
-    config: EncodingConfig, chunk: int, residuals: tuple, cotangent: Float[Array, "M L*F"] | SymbolicZero
+    config: EncodingConfig,
+    chunk: int,
+    first_level: int,
+    residuals: tuple,
+    cotangent: Float[Array, "M L*F"] | SymbolicZero,
 ) -> tuple:
     """Scatters into the tables, and gathers for the coordinates, only where that gradient is used."""
     (features, layout, tet_ids, lambdas, num_used, _), (of_features, of_lambdas) = residuals
@@ -137,7 +148,8 @@ def _encode_backward(
 
     d_features = None if of_features is None else jnp.zeros_like(features)
     d_coordinates = None if of_lambdas is None else jax.tree.map(jnp.zeros_like, points.coordinates)
-    d_features, d_coordinates = _for_levels(config, grid, add_level, (d_features, d_coordinates))
+    sums = d_features, d_coordinates
+    d_features, d_coordinates = _for_levels(config, grid, first_level, add_level, sums)
     if of_lambdas is None:
         return d_features, None, None, None, None, None
 
@@ -177,8 +189,10 @@ def _rows(features: Float[Array, "entries F"], entries: Int[Array, " M"]) -> Flo
     return features.at[entries].get(mode="promise_in_bounds")
 
 
-def _for_levels(config: EncodingConfig, grid: Grid, add_level: Callable[..., Any], carry: Any) -> Any:
-    """Fold `add_level` over the levels, one loop for each way of finding entries."""
+def _for_levels(
+    config: EncodingConfig, grid: Grid, first_level: int, add_level: Callable[..., Any], carry: Any
+) -> Any:
+    """Fold `add_level` over the levels from the first on, one loop for each way of finding entries."""
     resolutions = jnp.asarray(config.resolutions, jnp.int32)
     first = 0
     for count, address in grid.runs:
@@ -189,7 +203,7 @@ def _for_levels(config: EncodingConfig, grid: Grid, add_level: Callable[..., Any
             entries = partial(address, level, resolution)
             return add_level(level, partial(grid.corners, resolution), entries, carry)
 
-        if count:  # a loop over none is traced too, and would read from empty ranks
-            carry = jax.lax.fori_loop(first, first + count, body, carry)
-        first += count
+        begin, first = max(first, first_level), first + count
+        if begin < first:  # a loop over none is traced too, and would read from empty ranks
+            carry = jax.lax.fori_loop(begin, first, body, carry)
     return carry

@@ -26,6 +26,21 @@ from nimpostor_jax.encoding.layout import DENSE, SIZE_BITS
 from nimpostor_jax.types import HashLayout
 
 
+def by_vertex(
+    corner_order: Int[Array, "T 4"], tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+) -> Coordinates:
+    """Barycentric coordinates in the order of their tets' corners."""
+    shifts = jnp.arange(0, 8, 2)
+    packed = jnp.sum(corner_order << shifts, axis=1)[tet_ids]  # four times 2 bits: one gather
+    columns = []
+    for i in range(4):
+        corner = (packed >> (2 * i)) & 3
+        low = jnp.where(corner == 1, lambdas[:, 1], lambdas[:, 0])
+        high = jnp.where(corner == 3, lambdas[:, 3], lambdas[:, 2])
+        columns.append(jnp.where(corner >= 2, high, low))
+    return tuple(columns)
+
+
 @dataclass(frozen=True)
 class TetGrid:
     """The grids of all tets."""
@@ -55,15 +70,7 @@ class TetGrid:
         lambdas = jnp.clip(lambdas, 0, 1)
         if self.config.layout == "per_tet":
             return tuple(lambdas[:, i] for i in range(4))
-        shifts = jnp.arange(0, 8, 2)
-        packed = jnp.sum(self.layout.corner_order << shifts, axis=1)[tet_ids]  # four times 2 bits: one gather
-        columns = []
-        for i in range(4):
-            corner = (packed >> (2 * i)) & 3
-            low = jnp.where(corner == 1, lambdas[:, 1], lambdas[:, 0])
-            high = jnp.where(corner == 3, lambdas[:, 3], lambdas[:, 2])
-            columns.append(jnp.where(corner >= 2, high, low))
-        return tuple(columns)
+        return by_vertex(self.layout.corner_order, tet_ids, lambdas)
 
     def corners(self, resolution: Int[Array, ""], coordinates: Coordinates) -> Corners:
         """Weights and nodes (four coordinates) around each point.

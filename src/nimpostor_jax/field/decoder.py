@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.config import ImpostorConfig
@@ -54,6 +55,17 @@ def init_decoders(key: Array, config: ImpostorConfig, num_sets: int = 1) -> Para
 def num_decoder_sets(parameters: Parameters) -> int:
     """D."""
     return parameters["density"][0]["weight"].shape[0]
+
+
+def reorder_features(parameters: Parameters, order: Int[np.ndarray, " C"]) -> Parameters:
+    """Decoders of the same functions for position features in another order: `features[:, order]`."""
+
+    def reordered(layers: list) -> list:
+        weight = layers[0]["weight"]
+        first = jnp.concatenate([weight[:, order], weight[:, len(order) :]], axis=1)
+        return [layers[0] | {"weight": first}, *layers[1:]]
+
+    return parameters | {name: reordered(layers) for name, layers in parameters.items()}
 
 
 def decode_density(

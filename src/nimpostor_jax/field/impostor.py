@@ -8,14 +8,28 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.config import ImpostorConfig
+from nimpostor_jax.encoding import merged
 from nimpostor_jax.encoding.box_grid import build_box_layout
 from nimpostor_jax.encoding.hash_grid import encode, init_features
 from nimpostor_jax.encoding.layout import build_layout
+from nimpostor_jax.encoding.merged import encode_merged
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
-from nimpostor_jax.field.decoder import decode_appearance, decode_density, init_decoders
+from nimpostor_jax.field.decoder import (
+    decode_appearance,
+    decode_density,
+    init_decoders,
+    reorder_features,
+)
 from nimpostor_jax.geometry.polar import nearest_rotation
 from nimpostor_jax.geometry.tetrahedron import corners, deformation_gradients
-from nimpostor_jax.types import BoxLayout, HashLayout, HashTables, NeuralImpostor, TetMesh
+from nimpostor_jax.types import (
+    BoxLayout,
+    HashLayout,
+    HashTables,
+    MergedTables,
+    NeuralImpostor,
+    TetMesh,
+)
 
 
 def init_impostor(key: Array, mesh: TetMesh, config: ImpostorConfig) -> NeuralImpostor:
@@ -48,7 +62,26 @@ def features(
 
     Features that are `known` are only given their derivatives.
     """
-    return encode(impostor.tables, impostor.config.encoding, tet_ids, lambdas, num_used, known)
+    config = impostor.config.encoding
+    tables: HashTables | MergedTables = impostor.tables
+    if isinstance(tables, MergedTables):
+        return encode_merged(tables, config, tet_ids, lambdas, num_used) if known is None else known
+    return encode(tables, config, tet_ids, lambdas, num_used, known)
+
+
+def merge_levels(impostor: NeuralImpostor, max_megabytes: float = 256) -> NeuralImpostor:
+    """The same impostor with its coarse levels merged, as many as fit (`encoding.merged`).
+
+    For rendering only: frames become faster, but tables can no longer be trained, saved or edited. Host code.
+    """
+    encoding = impostor.config.encoding
+    tables: HashTables | MergedTables = impostor.tables
+    if isinstance(tables, MergedTables):
+        return impostor
+    tables = merged.merge_levels(impostor.tables, encoding, max_megabytes)
+    order = merged.feature_order(tables, encoding)
+    decoders = reorder_features(impostor.decoders, order)
+    return dataclasses.replace(impostor, tables=tables, decoders=decoders)  # type: ignore[arg-type]
 
 
 def density(

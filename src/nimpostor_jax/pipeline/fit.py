@@ -141,11 +141,12 @@ def fit(
             state, metrics = compiled(state, impostor, batch, jnp.asarray(rate, jnp.float32), config=render)
             progress.step += 1
             bar.update()
-            if clock is None or progress.step % _SYNC_EVERY == 0:
-                jax.block_until_ready(metrics)
+            logged = progress.step % config.log_every == 0 or clock is None
+            if logged or progress.step % _SYNC_EVERY == 0:
+                jax.block_until_ready(metrics)  # before the clock is read, which a log's line stops
             now = time.perf_counter()
             progress.seconds += now - clock if clock is not None else 0.0
-            if progress.step % config.log_every == 0 or clock is None:
+            if logged:
                 record = records.write(progress, metrics, rate, config.rays_per_batch)
                 bar.set_postfix({k: f"{record[k]:.4g}" for k in ("loss", "psnr", "rays_per_second")})
                 if record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps:
@@ -189,7 +190,7 @@ def _grow(config: RenderConfig) -> RenderConfig:
     capacity = min(most, 2 * (sampler.capacity_per_ray or most))
     return dataclasses.replace(
         grow_march(config),
-        sampler=dataclasses.replace(sampler, capacity_per_ray=capacity),
+        sampler=dataclasses.replace(sampler, capacity_per_ray=capacity, occupied_per_ray=None),
     )
 
 

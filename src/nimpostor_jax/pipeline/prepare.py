@@ -33,17 +33,23 @@ from nimpostor_jax.types import NeuralImpostor
 Log = Callable[[str], None]
 
 MIN_CELL = 0.5  # pixels across a cell of the finest level
+# XLA's CPU back end compiles a loop whose body touches fewer bytes into one function, instead of calling one
+# for each operation. This takes in the march of a tile of rays, but no loop over chunks of samples.
+SMALL_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=10000000"
 
 
 def use_all_cores() -> None:
     """Give XLA's CPU back end one device a core, over which training and frames are spread.
 
     Loops, gathers and scatters of one device run on one core. Call before any other use of jax; without
-    effect on accelerators or where the number of devices has been chosen already. On Linux, memory that is
-    freed stays with the process.
+    effect on accelerators or where the number of devices has been chosen already. Small loops are compiled as
+    a whole, unless `XLA_FLAGS` has such options. On Linux, memory that is freed stays with the process.
     """
-    if "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_force_host_platform_device_count" not in flags:
         jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+    if "xla_backend_extra_options" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {SMALL_LOOPS}".strip()
     _keep_freed_memory()
 
 

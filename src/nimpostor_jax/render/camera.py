@@ -1,5 +1,7 @@
 """Pinhole cameras and rays. OpenGL axes: the camera looks down -z, y is up; pixel centres lie at + 0.5."""
 
+from functools import cache
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -29,13 +31,17 @@ def image_pixels(height: int, width: int) -> Float[Array, "height width 2"]:
     return jnp.stack([x, y], axis=-1)
 
 
+@cache
 def tile_order(height: int, width: int) -> Int[np.ndarray, " pixels"]:
     """Pixel indices tile by tile: rays that are neighbours in the list are neighbours in the image.
 
     Traversal culls and marches consecutive rays together, so rays of an image should come in this order.
     """
     y, x = np.mgrid[0:height, 0:width]
-    return np.lexsort(((x % TILE).ravel(), (y % TILE).ravel(), (x // TILE).ravel(), (y // TILE).ravel()))
+    keys = ((x % TILE).ravel(), (y % TILE).ravel(), (x // TILE).ravel(), (y // TILE).ravel())
+    order = np.lexsort(keys)
+    order.flags.writeable = False  # kept for the next frame
+    return order
 
 
 def to_local(mesh: TetMesh, rays: Rays) -> Rays:

@@ -7,6 +7,7 @@ caller.
 
 import dataclasses
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +16,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.sampling import segment_measure, step_boundaries
-from nimpostor_jax.render.segments import locate_segments
+from nimpostor_jax.render.sampling import plan_samples, segment_measure, step_boundaries
+from nimpostor_jax.render.segments import in_cells, locate_segments
+from nimpostor_jax.render.selection import present_samples
 from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
-from nimpostor_jax.types import Rays, TetMesh
+from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
 
 # A chunk of a frame is 32 image tiles from all over it, whose mean varies by a tenth. Room that is not used
 # costs next to nothing; rays that do not fit cost a second program.
@@ -48,49 +50,78 @@ def all_entries(
     return entries, dataclasses.replace(config, max_entries_per_ray=most)
 
 
+class _Demand(NamedTuple):
+    tets: Int[Array, " R"]  # that each ray crosses
+    overflow: Bool[Array, ""]  # some did not fit
+    total: Float[Array, " R"]  # each ray's measure
+    occupied: Int[Array, ""] | None  # samples in occupied cells
+
+
 @partial(jax.jit, static_argnames="config")
 def _demand(
-    mesh: TetMesh, tables: MarchTables, rays: Rays, config: RenderConfig
-) -> tuple[Int[Array, " R"], Bool[Array, ""], Float[Array, " R"]]:
-    """Tets that each ray crosses, whether any did not fit, and each ray's measure."""
+    mesh: TetMesh, tables: MarchTables, rays: Rays, config: RenderConfig, field: NeuralImpostor | None
+) -> _Demand:
     local = to_local(mesh, rays)
     crossings = traverse(tables, local, config.march)
     segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
     measure = segment_measure(segments, config.sampler.measure)
     total = jax.ops.segment_sum(measure, segments.rays, rays.origins.shape[0])
-    return jnp.sum(crossings.codes >= 0, axis=0), jnp.any(crossings.overflow), total
+    occupied = None
+    if field is not None:
+        plan = plan_samples(in_cells(segments, field.embedding), config.sampler, config.density_measure)
+        _, _, occupied = present_samples(field, plan, config)
+    return _Demand(
+        tets=jnp.sum(crossings.codes >= 0, axis=0),
+        overflow=jnp.any(crossings.overflow),
+        total=total,
+        occupied=occupied,
+    )
 
 
 def fit_capacities(
-    mesh: TetMesh, tables: MarchTables, rays: Rays, config: RenderConfig, *, margin: float = 1.25
+    mesh: TetMesh,
+    tables: MarchTables,
+    rays: Rays,
+    config: RenderConfig,
+    *,
+    field: NeuralImpostor | None = None,
+    margin: float = 1.25,
 ) -> RenderConfig:
     """A config whose buffers hold these sample rays (drawn like those to come), with a margin.
 
     `margin` is that of a single ray's slots; buffers that rays share have `SHARED_MARGIN`. Slots are rounded
-    up to multiples of 8; `max_samples_per_ray` of the given config stays the limit.
+    up to multiples of 8; `max_samples_per_ray` of the given config stays the limit. With a trained `field`,
+    the buffers behind its occupancy are fitted too.
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
-    tets, overflow, total = _demand(mesh, tables, rays, config)
+    if field is not None and (field.occupied is None or not config.skip_empty) and not field.gates:
+        field = None  # all samples are present
+    demand = _demand(mesh, tables, rays, config, field)
     for _ in range(MAX_GROWTH):
-        if not overflow:
+        if not demand.overflow:
             break
         config = grow_march(config)
-        tets, overflow, total = _demand(mesh, tables, rays, config)
-    if overflow:
+        demand = _demand(mesh, tables, rays, config, field)
+    if demand.overflow:
         raise ValueError(
             f"a ray crosses more than {config.march.max_tets_per_ray} tets or enters the cage more than "
             f"{config.march.max_entries_per_ray} times; "
             "raise MarchConfig.max_tets_per_ray and max_entries_per_ray"
         )
     boundaries = step_boundaries(config.sampler)
-    wanted = np.clip(np.searchsorted(boundaries, np.asarray(total) * (1 - 1e-5)), 0, len(boundaries) - 1)
+    total = np.asarray(demand.total)
+    wanted = np.clip(np.searchsorted(boundaries, total * (1 - 1e-5)), 0, len(boundaries) - 1)
     most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
-    most_tets = _round_up(margin * int(jnp.max(tets)))
+    tets = np.asarray(demand.tets)
+    most_tets = _round_up(margin * int(tets.max()))
     march = dataclasses.replace(
-        config.march, max_tets_per_ray=most_tets, capacity_per_ray=min(most_tets, _mean(np.asarray(tets)))
+        config.march, max_tets_per_ray=most_tets, capacity_per_ray=min(most_tets, _mean(tets))
     )
     sampler = dataclasses.replace(
-        config.sampler, max_samples_per_ray=most, capacity_per_ray=min(most, _mean(wanted))
+        config.sampler,
+        max_samples_per_ray=most,
+        capacity_per_ray=min(most, _mean(wanted)),
+        occupied_per_ray=None if field is None else _mean(np.asarray(demand.occupied) / len(total)),
     )
     return dataclasses.replace(config, march=march, sampler=sampler)
 

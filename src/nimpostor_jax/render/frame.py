@@ -13,6 +13,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Bool, Float
 
 from nimpostor_jax.config import MarchConfig, RenderConfig
+from nimpostor_jax.field.impostor import merge_levels
 from nimpostor_jax.render.baked import render_baked_rays
 from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, all_entries, fit_capacities, grow_march, ray_entries
@@ -47,6 +48,15 @@ def _tiled_pixels(height: int, width: int) -> jax.Array:
     return image_pixels(height, width).reshape(-1, 2)[tile_order(height, width)]
 
 
+def for_frames(impostor: NeuralImpostor, max_megabytes: float = 256) -> NeuralImpostor:
+    """The same impostor as many frames want it: levels merged (`field.merge_levels`), on all local devices.
+
+    It can be deformed, but no longer trained or edited. Finding the nodes' features takes about as long as
+    a frame, so it pays for animations and large images.
+    """
+    return jax.device_put(merge_levels(impostor, max_megabytes), NamedSharding(device_mesh(), P()))
+
+
 def frame_config(
     impostor: NeuralImpostor | BakedImpostor, camera: Camera, config: RenderConfig
 ) -> RenderConfig:
@@ -65,7 +75,8 @@ def frame_config(
     config = dataclasses.replace(config, march=march)
     chosen = hits[np.linspace(0, hits.size - 1, CHUNK).round().astype(int)]
     probe = jax.tree.map(lambda x: x[chosen], rays)
-    return fit_capacities(impostor.mesh, tables, probe, config)
+    field = None if isinstance(impostor, BakedImpostor) else impostor
+    return fit_capacities(impostor.mesh, tables, probe, config, field=field)
 
 
 def refined(config: RenderConfig) -> RenderConfig:
@@ -79,6 +90,7 @@ def refined(config: RenderConfig) -> RenderConfig:
         cone_angle=sampler.cone_angle / factor**2,  # growth a step: of smaller steps, and of more of them
         max_samples_per_ray=most,
         capacity_per_ray=mean,
+        occupied_per_ray=sampler.occupied_per_ray and math.ceil(factor * sampler.occupied_per_ray),
     )
     # A sample's weight is in proportion to its step.
     return dataclasses.replace(
@@ -274,7 +286,7 @@ def _spread(rays: np.ndarray, chunk: int) -> list[np.ndarray]:
 
 
 def _grow(config: RenderConfig) -> RenderConfig:
-    sampler = dataclasses.replace(config.sampler, capacity_per_ray=None)
+    sampler = dataclasses.replace(config.sampler, capacity_per_ray=None, occupied_per_ray=None)
     return dataclasses.replace(grow_march(config), sampler=sampler)
 
 

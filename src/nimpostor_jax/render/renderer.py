@@ -60,7 +60,7 @@ def render_samples(
     segments = march_segments(impostor.mesh, local, config, tables, entries)
     segments = in_cells(segments, impostor.embedding)
     plan = plan_samples(segments, config.sampler, config.density_measure, jitter, refinement)
-    chosen, num_used = present_samples(impostor, plan, config)
+    plan, chosen, num_used = present_samples(impostor, plan, config)
     features = None
     if config.min_weight > 0:
         chosen, features, num_used = visible_samples(impostor, plan, chosen, num_used, config, refinement)

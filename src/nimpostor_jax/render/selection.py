@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import map_used, pack_where
+from nimpostor_jax.chunks import default_chunk, map_used, pack_where, padded_size
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import CLOSED, MIXED, OPEN, is_kept
@@ -22,10 +22,30 @@ from nimpostor_jax.types import NeuralImpostor
 Chosen = tuple[Int[Array, " M"], Int[Array, ""]]  # numbers of samples, by ray, and how many are meant
 
 
-def present_samples(impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig) -> Chosen:
-    """Samples in parts of cells that may be seen, and that gates let through, in order along each ray."""
+def present_samples(
+    impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig
+) -> tuple[SamplePlan, Int[Array, " M"], Int[Array, ""]]:
+    """Samples in parts of cells that may be seen, and that gates let through, in order along each ray.
+
+    Later buffers have room for `SamplerConfig.occupied_per_ray`; the plan flags rays that lose some.
+    """
     chosen, num_used = gated_samples(impostor, plan, *occupied_samples(impostor, plan, config))
-    return in_order(plan, chosen, num_used), num_used
+    plan, chosen, num_used = _limited(plan, chosen, num_used, config.sampler.occupied_per_ray)
+    return plan, in_order(plan, chosen, num_used), num_used
+
+
+def _limited(
+    plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""], per_ray: int | None
+) -> tuple[SamplePlan, Int[Array, " M"], Int[Array, ""]]:
+    """As many of the first samples as `per_ray` makes room for."""
+    num_rays = plan.firsts.shape[0]
+    room = padded_size(num_rays * (per_ray or 0), default_chunk(chosen.size))  # whole chunks, as in the plan
+    if per_ray is None or room >= chosen.size:
+        return plan, chosen, num_used
+    first_lost = plan.segments.rays[plan.owners[chosen[room]]]
+    lost = (num_used > room) & (jnp.arange(num_rays) >= first_lost)
+    plan = dataclasses.replace(plan, overflow=plan.overflow | lost)
+    return plan, chosen[:room], jnp.minimum(num_used, room)
 
 
 def occupied_samples(impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig) -> Chosen:

@@ -49,7 +49,7 @@ def gather_by_tet(
     segments = march_segments(impostor.mesh, local, config, entries=batch.entries)
     in_field = in_cells(segments, impostor.embedding)
     plan = plan_samples(in_field, config.sampler, config.density_measure, batch.jitter)
-    chosen, count = present_samples(impostor, plan, config)
+    plan, chosen, count = present_samples(impostor, plan, config)
     chosen, features, count = visible_samples(impostor, plan, chosen, count, config, None)
     samples, owners = place_samples(plan, chosen, count), plan.owners[chosen]
     sigmas = sample_densities(impostor, samples.tet_ids, features, count)
