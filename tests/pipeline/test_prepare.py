@@ -1,9 +1,11 @@
 """pipeline.prepare: what the scene says about the config."""
 
+import os
+
 import pytest
 
 from nimpostor_jax.config import ExperimentConfig
-from nimpostor_jax.pipeline.prepare import fit_levels
+from nimpostor_jax.pipeline.prepare import SMALL_LOOPS, fit_levels, use_all_cores
 
 
 @pytest.mark.parametrize("pixels, levels", [(100.0, 14), (20.0, 10), (0.1, 1)])
@@ -14,3 +16,11 @@ def test_levels_with_cells_below_half_a_pixel_are_left_out(pixels, levels):
     assert config.impostor.encoding.num_levels == levels
     assert f"the finest of {levels} levels" in said[0]
     assert ("14 were asked for" in said[0]) == (levels < 14)
+
+
+@pytest.mark.parametrize("own", ["", " --xla_backend_extra_options=some_option=1"])
+def test_small_loops_are_compiled_as_a_whole_unless_the_user_has_such_options(own, monkeypatch):
+    flags = "--xla_force_host_platform_device_count=2" + own  # as the number of devices, which is chosen
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    use_all_cores()
+    assert os.environ["XLA_FLAGS"] == (flags if own else f"{flags} {SMALL_LOOPS}")

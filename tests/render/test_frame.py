@@ -13,6 +13,8 @@ from scenes import RENDER, exact
 
 from nimpostor_jax import chunks
 from nimpostor_jax.config import MarchConfig, SamplerConfig
+from nimpostor_jax.edit.compose import compose
+from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.render import capacity
 from nimpostor_jax.render import frame as frames
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
@@ -22,6 +24,7 @@ from nimpostor_jax.render.occupancy import num_cells
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.sampling import step_boundaries
 from nimpostor_jax.render.traverse import march_tables, traverse
+from nimpostor_jax.train.step import trainable
 
 render = jax.jit(render_rays, static_argnames="config")
 
@@ -85,6 +88,16 @@ def test_merged_levels_give_the_same_frame(scene):
     )
     expected = impostor.replace(mesh=impostor.mesh.replace(vertices=1.1 * impostor.mesh.vertices))
     check_equal(render_frame(moved, camera, RENDER), whole_image(expected, camera, RENDER))
+
+
+def test_merged_levels_are_for_frames_only(scene, tmp_path):
+    merged = for_frames(scene[0])
+    assert for_frames(merged).tables.chains == merged.tables.chains
+    saved = tmp_path / "impostor.npz"
+    for use in (trainable, lambda each: compose([each]), lambda each: save_impostor(saved, each)):
+        with pytest.raises(ValueError, match="merged for frames"):
+            use(merged)
+    assert not list(tmp_path.iterdir())
 
 
 def partly_occupied(impostor, share):

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from nimpostor_jax.config import ImpostorConfig
 from nimpostor_jax.encoding.layout import join_layouts
 from nimpostor_jax.field.decoder import Parameters
+from nimpostor_jax.field.impostor import check_unmerged
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.render.occupancy import finer_cells
 from nimpostor_jax.types import Embedding, HashLayout, HashTables, NeuralImpostor
@@ -117,6 +118,8 @@ def _shifted(parts: Sequence[np.ndarray], sizes: Sequence[int]) -> list[np.ndarr
 
 def _joined_tables(impostors: Sequence[NeuralImpostor]) -> tuple[Float[jax.Array, "entries F"], HashLayout]:
     """All features, level by level; a level that an impostor does not have is one entry of zeros for it."""
+    for each in impostors:
+        check_unmerged(each)
     layouts: list[HashLayout] = [each.tables.layout for each in impostors]  # type: ignore[misc]
     joined = join_layouts(layouts)
     features = []

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.encoding.layout import build_layout, join_layouts
 from nimpostor_jax.field.decoder import num_decoder_sets
+from nimpostor_jax.field.impostor import check_unmerged
 from nimpostor_jax.types import Embedding, HashLayout, HashTables, NeuralImpostor, TetMesh
 
 
@@ -43,6 +44,7 @@ def with_region(
     New cells' tables are zeros. Where no tet lies in an old cell, the old field is left behind. Raises
     ValueError for layouts that know no tets.
     """
+    check_unmerged(field)
     if not isinstance(field.tables.layout, HashLayout):
         raise ValueError(f"layout {field.config.encoding.layout!r} has no tables of single tets to retrain")
     changed = np.flatnonzero(cells < 0)

@@ -72,7 +72,7 @@ def features(
 def merge_levels(impostor: NeuralImpostor, max_megabytes: float = 256) -> NeuralImpostor:
     """The same impostor with its coarse levels merged, as many as fit (`encoding.merged`).
 
-    For rendering only: frames become faster, but tables can no longer be trained, saved or edited. Host code.
+    For rendering only: frames become faster, but tables can no longer be trained, edited or saved. Host code.
     """
     encoding = impostor.config.encoding
     tables: HashTables | MergedTables = impostor.tables
@@ -82,6 +82,13 @@ def merge_levels(impostor: NeuralImpostor, max_megabytes: float = 256) -> Neural
     order = merged.feature_order(tables, encoding)
     decoders = reorder_features(impostor.decoders, order)
     return dataclasses.replace(impostor, tables=tables, decoders=decoders)  # type: ignore[arg-type]
+
+
+def check_unmerged(impostor: NeuralImpostor) -> None:
+    """Raise ValueError where levels are merged: such tables cannot be trained, edited or saved."""
+    tables: HashTables | MergedTables = impostor.tables
+    if isinstance(tables, MergedTables):
+        raise ValueError("this impostor's levels are merged for frames; pass the one that was merged")
 
 
 def density(

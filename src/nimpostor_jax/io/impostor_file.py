@@ -17,6 +17,7 @@ import numpy as np
 from nimpostor_jax import types
 from nimpostor_jax.config import ImpostorConfig
 from nimpostor_jax.config_dict import from_dict, to_dict
+from nimpostor_jax.field.impostor import check_unmerged
 from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.types import BakedImpostor, NeuralImpostor
 
@@ -41,12 +42,14 @@ _RECORDS: dict[str, Any] = {
 def save_impostor(path: str | Path, impostor: NeuralImpostor | BakedImpostor) -> None:
     """Write an impostor, baked or not, as a self-contained `.npz`: arrays by their path, and a JSON header.
 
-    The header holds the format's version, the configuration and the pytree's structure. The file
-    appears whole or not at all. Raises ValueError for another suffix and for decoders with anything
+    The header holds the format's version, the configuration and the pytree's structure. The file appears
+    whole or not at all. Raises ValueError for another suffix, for merged levels, and for decoders with anything
     but dicts with text keys, lists, tuples, None and arrays.
     """
     if Path(path).suffix != ".npz":
         raise ValueError(f"{path}: the suffix of an impostor file must be .npz")
+    if isinstance(impostor, NeuralImpostor):
+        check_unmerged(impostor)
     arrays: dict[str, np.ndarray] = {}
     structure = _pack(impostor, _ROOT, arrays)
     header = {

@@ -6,7 +6,6 @@ from functools import cache, partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
@@ -157,7 +156,8 @@ class View:
     def __init__(self, impostor: NeuralImpostor | BakedImpostor, camera: Camera, config: RenderConfig):
         self._impostor, self._config = impostor, config
         self._tables = _march_tables(impostor.mesh)
-        self._rays = _tiled_rays(camera, camera.height, camera.width)
+        # On the host, where chunks are picked without a program for each pick.
+        self._rays = jax.tree.map(np.asarray, _tiled_rays(camera, camera.height, camera.width))
         mesh = device_mesh()
         self._num_devices = mesh.size
         self._replicas = jax.device_put((impostor, self._tables), NamedSharding(mesh, P()))
@@ -169,7 +169,7 @@ class View:
         """Entries of all of the camera's rays, on the host; whole tiles of them go to each device."""
         count = self._rays.origins.shape[0]
         padding = (0, -count % (TILE * TILE * self._num_devices))
-        rays = jax.tree.map(lambda x: jnp.pad(x, (padding, (0, 0)), mode="edge"), self._rays)
+        rays = jax.tree.map(lambda x: np.pad(x, (padding, (0, 0)), mode="edge"), self._rays)
         impostor, tables = self._replicas
         placed = jax.device_put(rays, self._by_ray)
         entries = _entries_sharded(impostor.mesh, tables, placed, self._config.march)
@@ -209,14 +209,15 @@ class View:
             entries = jax.tree.map(lambda x: x[padded], self._entries)
         else:
             entries = ray_entries(self._impostor.mesh, self._tables, rays, config.march)
+            entries = jax.tree.map(np.asarray, entries)
         used = np.arange(chunk) < len(pixels)
         entries = dataclasses.replace(
             entries,
-            holds=jnp.where(used[:, None], entries.holds, -1),
+            holds=np.where(used[:, None], entries.holds, -1),
             overflow=entries.overflow & used,
             unsure=entries.unsure & used,
         )
-        refinements = jnp.full(chunk, refinement, rays.origins.dtype)
+        refinements = np.full(chunk, refinement, rays.origins.dtype)
         placed = jax.device_put((rays, entries, refinements), self._by_ray)
         return _render_sharded(*self._replicas, *placed, config)
 

@@ -18,7 +18,7 @@ from nimpostor_jax.render.occupancy import cells_of, num_cells, random_points
 from nimpostor_jax.render.renderer import render_samples
 from nimpostor_jax.render.traverse import Entries
 from nimpostor_jax.train.losses import photometric
-from nimpostor_jax.types import MergedTables, NeuralImpostor, Rays
+from nimpostor_jax.types import NeuralImpostor, Rays
 
 Parameters = dict[str, Any]
 Metrics = dict[str, Array]
@@ -54,8 +54,7 @@ class TrainState:
 
 def trainable(impostor: NeuralImpostor) -> Parameters:
     """The impostor's trained arrays. Raises ValueError where its levels are merged."""
-    if isinstance(impostor.tables, MergedTables):
-        raise ValueError("levels were merged for frames; train the impostor that was given to merge_levels")
+    field.check_unmerged(impostor)
     return {"features": impostor.tables.features, "decoders": impostor.decoders}
 
 
