@@ -43,8 +43,8 @@ def save_impostor(path: str | Path, impostor: NeuralImpostor | BakedImpostor) ->
     """Write an impostor, baked or not, as a self-contained `.npz`: arrays by their path, and a JSON header.
 
     The header holds the format's version, the configuration and the pytree's structure. The file appears
-    whole or not at all. Raises ValueError for another suffix, for merged levels, and for decoders with anything
-    but dicts with text keys, lists, tuples, None and arrays.
+    whole or not at all. Raises ValueError for another suffix, merged levels, and decoders with anything but
+    dicts with text keys, lists, tuples, None and arrays.
     """
     if Path(path).suffix != ".npz":
         raise ValueError(f"{path}: the suffix of an impostor file must be .npz")
