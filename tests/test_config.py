@@ -201,6 +201,7 @@ def test_resolutions_and_feature_dim():
     assert EncodingConfig(num_levels=6).resolutions == (1, 2, 3, 4, 6, 8)
     assert EncodingConfig(num_levels=4, base_resolution=5).resolutions == (5, 10, 15, 20)
     assert EncodingConfig(num_levels=4, growth=2.0).resolutions == (1, 2, 4, 8)
+    assert EncodingConfig(growth=2.0).resolutions[-1] == 4096  # the paper's growth alone may be asked for
     # round(2 * 1.5**l) = 2, 3, 4.5 -> 4 (to even), 6.75 -> 7
     encoding = EncodingConfig(num_levels=4, base_resolution=2, growth=1.5, features_per_level=3)
     assert encoding.resolutions == (2, 3, 4, 7)

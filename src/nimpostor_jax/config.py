@@ -36,7 +36,7 @@ class EncodingConfig:
 
     layout: Layout = "per_simplex"
     interpolation: Interpolation = "simplex"
-    num_levels: int = 14  # at most: training leaves out levels with cells below half a pixel
+    num_levels: int = 13  # at most: training leaves out levels with cells below half a pixel
     features_per_level: int = 2
     base_resolution: int = 1
     growth: float | None = None  # None: two levels an octave

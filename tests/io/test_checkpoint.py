@@ -162,7 +162,7 @@ def test_another_impostor_config_names_the_first_field(tmp_path):
     other = dataclasses.replace(
         CONFIG, impostor=ImpostorConfig(encoding=EncodingConfig(num_levels=3, growth=1.5))
     )
-    message = r"impostor\.encoding\.num_levels is 14 there and 3 here"
+    message = r"impostor\.encoding\.num_levels is 13 there and 3 here"
     with pytest.raises(ValueError, match=message):
         restore_checkpoint(tmp_path, {"w": jnp.zeros(2)}, other)
 

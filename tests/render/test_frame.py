@@ -94,6 +94,15 @@ def test_merged_levels_are_for_frames_only(scene, tmp_path):
     merged = for_frames(scene[0])
     assert for_frames(merged).tables.chains == merged.tables.chains
     saved = tmp_path / "impostor.npz"
+    rays = pixel_rays(scene[1], image_pixels(4, 4).reshape(-1, 2))
+    config = dataclasses.replace(RENDER, min_weight=1e-3)
+
+    def brightness(vertices):
+        moved = merged.replace(mesh=merged.mesh.replace(vertices=vertices))
+        return render_rays(moved, rays, config).color.sum()
+
+    with pytest.raises(ValueError, match="no derivatives"):
+        jax.grad(brightness)(merged.mesh.vertices)
     for use in (trainable, lambda each: compose([each]), lambda each: save_impostor(saved, each)):
         with pytest.raises(ValueError, match="merged for frames"):
             use(merged)

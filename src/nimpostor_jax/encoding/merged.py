@@ -101,7 +101,7 @@ def _node_features(
     resolution, layout = config.resolutions[chain[-1]], tables.layout
     nodes = node_coordinates(resolution)
     steps = np.diff(nodes, axis=1, prepend=0, append=resolution)  # by ascending vertex id
-    weights = jnp.asarray(steps / resolution, tables.features.dtype)
+    weights = jnp.asarray(steps / resolution, jnp.result_type(tables.features, jnp.float32))
     num_points = layout.corner_order.shape[0] * len(nodes)  # type: ignore[union-attr]
     per_call = max(1, POINTS // len(nodes)) * len(nodes)
     features = [
@@ -127,7 +127,7 @@ def _features_at(
     ranks = jnp.argsort(_orders(layout, config), axis=1)[tets]
     lambdas = jnp.take_along_axis(weights[numbers % len(weights)], ranks, axis=1)
     features = encode(tables, config, tets, lambdas).reshape(count, config.num_levels, -1)
-    return features[:, np.array(chain)].reshape(count, -1)
+    return features[:, np.array(chain)].reshape(count, -1).astype(tables.features.dtype)
 
 
 def _orders(layout: HashLayout, config: EncodingConfig) -> Int[Array, "T 4"]:
@@ -145,7 +145,7 @@ def encode_merged(
 ) -> Float[Array, "M L*F"]:
     """As `hash_grid.encode` of the tables that were merged, in `feature_order`; `config` is theirs.
 
-    Differentiable in the coordinates only, in forward mode.
+    Not differentiable in reverse mode.
     """
     num_points, chunk = tet_ids.shape[0], default_chunk(tet_ids.shape[0])
     used = jnp.asarray(num_points if num_used is None else num_used, jnp.int32)

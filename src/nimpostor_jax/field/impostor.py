@@ -65,8 +65,20 @@ def features(
     config = impostor.config.encoding
     tables: HashTables | MergedTables = impostor.tables
     if isinstance(tables, MergedTables):
-        return encode_merged(tables, config, tet_ids, lambdas, num_used) if known is None else known
+        if known is None:
+            return encode_merged(tables, config, tet_ids, lambdas, num_used)
+        return _without_derivative(known, lambdas)
     return encode(tables, config, tet_ids, lambdas, num_used, known)
+
+
+@jax.custom_jvp
+def _without_derivative(known: Float[Array, "M C"], lambdas: Float[Array, "M 4"]) -> Float[Array, "M C"]:
+    return known
+
+
+@_without_derivative.defjvp
+def _refuse(primals: tuple, tangents: tuple) -> tuple:
+    raise ValueError("levels merged for frames have no derivatives; differentiate what was merged")
 
 
 def merge_levels(impostor: NeuralImpostor, max_megabytes: float = 256) -> NeuralImpostor:

@@ -142,8 +142,9 @@ def fit(
             progress.step += 1
             bar.update()
             logged = progress.step % config.log_every == 0 or clock is None
-            if logged or progress.step % _SYNC_EVERY == 0:
-                jax.block_until_ready(metrics)  # before the clock is read, which a log's line stops
+            stops = (_SYNC_EVERY, config.checkpoint_every, config.eval_every or _SYNC_EVERY)
+            if logged or any(progress.step % every == 0 for every in stops):
+                jax.block_until_ready(metrics)  # before the clock is read, which what follows stops
             now = time.perf_counter()
             progress.seconds += now - clock if clock is not None else 0.0
             if logged:

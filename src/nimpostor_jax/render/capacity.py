@@ -68,8 +68,9 @@ def _demand(
     total = jax.ops.segment_sum(measure, segments.rays, rays.origins.shape[0])
     occupied = None
     if field is not None:
-        plan = plan_samples(in_cells(segments, field.embedding), config.sampler, config.density_measure)
-        _, _, occupied = present_samples(field, plan, config)
+        sampler = dataclasses.replace(config.sampler, capacity_per_ray=None, occupied_per_ray=None)
+        plan = plan_samples(in_cells(segments, field.embedding), sampler, config.density_measure)
+        _, _, occupied = present_samples(field, plan, dataclasses.replace(config, sampler=sampler))
     return _Demand(
         tets=jnp.sum(crossings.codes >= 0, axis=0),
         overflow=jnp.any(crossings.overflow),

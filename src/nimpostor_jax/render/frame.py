@@ -47,13 +47,15 @@ def _tiled_pixels(height: int, width: int) -> jax.Array:
     return image_pixels(height, width).reshape(-1, 2)[tile_order(height, width)]
 
 
-def for_frames(impostor: NeuralImpostor, max_megabytes: float = 256) -> NeuralImpostor:
+def for_frames(impostor: NeuralImpostor, max_megabytes: float = 512) -> NeuralImpostor:
     """The same impostor as many frames want it: levels merged (`field.merge_levels`), on all local devices.
 
-    It can be deformed, but no longer trained or edited. Finding the nodes' features takes about as long as
-    a frame, so it pays for animations and large images.
+    For rendering only, whether levels could be merged or not; it can be deformed. Merging takes about as long
+    as half a frame of 800 x 800, so it pays for animations and large images. The memory is that of all
+    devices together, each of which has a copy; a CPU with `use_all_cores` has a device a core.
     """
-    return jax.device_put(merge_levels(impostor, max_megabytes), NamedSharding(device_mesh(), P()))
+    mesh = device_mesh()
+    return jax.device_put(merge_levels(impostor, max_megabytes / mesh.size), NamedSharding(mesh, P()))
 
 
 def frame_config(

@@ -39,7 +39,8 @@ def _limited(
 ) -> tuple[SamplePlan, Int[Array, " M"], Int[Array, ""]]:
     """As many of the first samples as `per_ray` makes room for."""
     num_rays = plan.firsts.shape[0]
-    room = padded_size(num_rays * (per_ray or 0), default_chunk(chosen.size))  # whole chunks, as in the plan
+    wanted = num_rays * (per_ray or 0)
+    room = padded_size(wanted, default_chunk(wanted))  # whole chunks, as in the plan
     if per_ray is None or room >= chosen.size:
         return plan, chosen, num_used
     first_lost = plan.segments.rays[plan.owners[chosen[room]]]
