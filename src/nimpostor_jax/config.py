@@ -87,10 +87,10 @@ class EncodingConfig:
     @property
     def resolutions(self) -> tuple[int, ...]:
         """Grid resolution N_l = round(base * growth**l) of each level, or two of them an octave."""
-        base, growth, levels = self.base_resolution, self.growth, range(self.num_levels)
+        base, growth = self.base_resolution, self.growth
         if growth is not None:
-            return tuple(round(base * growth**level) for level in levels)
-        return tuple(base * (((2 + level % 2) << level // 2) // 2) for level in range(1, len(levels) + 1))
+            return tuple(round(base * growth**level) for level in range(self.num_levels))
+        return tuple(base * (((2 + n % 2) << n // 2) // 2) for n in range(1, self.num_levels + 1))
 
     @property
     def feature_dim(self) -> int:
