@@ -4,8 +4,8 @@
     python experiments/figure10.py --scene DIR --out=out/figure10 --quick
 
 The proxies are an envelope, the bounding box, a cube, and spheres (an icosahedron subdivided 0 to 3 times),
-with the paper's numbers of tets, the same parameter budget, and steps of at most two pixels. Cages and runs
-that are there are reused. Writes figure10.json (`rows`), .csv, .md and a picture of every proxy's render.
+with the paper's numbers of tets, and the same parameter budget. Cages and runs that are there are reused.
+Writes figure10.json (`rows`), .csv, .md and a picture of every proxy's render.
 """
 
 import argparse
@@ -32,9 +32,9 @@ from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.geometry.topology import Cage
 from nimpostor_jax.gin_flags import add_flags, run_cli
 from nimpostor_jax.io.blender import load_scene
-from nimpostor_jax.io.mesh_files import load_tets, save_tets
+from nimpostor_jax.io.mesh_files import save_tets
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.prepare import pixels_per_cell, use_all_cores
+from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.cage import cage_from_images
 from nimpostor_jax.preprocess.tetrahedralize import box_tets, run_ftetwild
 from nimpostor_jax.preprocess.visual_hull import visual_hull
@@ -47,7 +47,6 @@ PROXIES = {
 SAME_BUDGET = Path(__file__).parent / "configs" / "figure10.gin"
 FILL_CALLS, LONG_EDGE = 16, 0.2
 EDGE_SLOPE, EPSILON_SLOPE = 5, 1.3  # the count goes about as edges**-5, or as epsilon**-1.3
-STEP_PIXELS = 2.0
 SPREAD = 0.08  # of the logarithm of edges, around the best
 CLOSE_ENOUGH = 0.08  # logarithm
 COLUMNS = ("proxy", "tets", "target_tets", "psnr", "ssim", "lpips", "train_seconds", "parameters")
@@ -74,7 +73,7 @@ def main(argv: Sequence[str]) -> None:
         cage = folder / "cage.npz"
         if not cage.exists():
             save_tets(cage, *proxy_cage(proxy, args.scene, config))
-        trained = train_or_reuse("BarySpl", short_steps(config, args.scene, cage), args.scene, cage, folder)
+        trained = train_or_reuse("BarySpl", config, args.scene, cage, folder)
         runs.append(trained)
         rows.append({**trained.row, "proxy": proxy, "target_tets": PROXIES[proxy]})
         spread = max(row["psnr"] for row in rows) - min(row["psnr"] for row in rows)
@@ -84,17 +83,6 @@ def main(argv: Sequence[str]) -> None:
         )
         write_table(args.out / "figure10", rows, COLUMNS, notes)
     write_picture(args.out / "figure10.png", runs)
-
-
-def short_steps(config: ExperimentConfig, scene: str, cage: Path) -> ExperimentConfig:
-    """The config with steps of at most `STEP_PIXELS` in a cage: a step is a share of a tet of any size."""
-    train, _ = load_scene(resolve_scene(scene), config.data)
-    edge, sampler = pixels_per_cell(*load_tets(cage), train, 1), config.render.sampler
-    # From a corner of a regular tet to the face opposite the L1 distance is 2, the way 0.82 edges.
-    factor = max(1.0, sampler.step * 0.82 * edge / (2 * STEP_PIXELS))
-    most = math.ceil(factor * sampler.max_samples_per_ray)
-    sampler = dataclasses.replace(sampler, step=sampler.step / factor, max_samples_per_ray=most)
-    return dataclasses.replace(config, render=dataclasses.replace(config.render, sampler=sampler))
 
 
 def proxy_cage(proxy: str, scene: str, config: ExperimentConfig) -> Cage:

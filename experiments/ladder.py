@@ -59,12 +59,12 @@ class Trained(NamedTuple):
 def config_of(
     method: str, resolution: int, configs: Sequence[Path], bindings: Sequence[str]
 ) -> ExperimentConfig:
-    """A method's config at an image width, with `CURVE_POINTS`; the caller's files and bindings come last."""
+    """A method's config at an image width, with `CURVE_POINTS`; the caller's files override its own."""
     files = [CONFIGS / f"{METHODS[method]}.gin", *configs]
     bindings = [f"DataConfig.resolution={resolution}", *bindings]
     every = max(1, load_config(files, bindings).train.steps // CURVE_POINTS)
     curve = [f"TrainConfig.eval_every={every}", f"TrainConfig.log_every={every}"]
-    return load_config(files, [*curve, *bindings])
+    return load_config(files, [*bindings, *curve])
 
 
 def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path, workdir: Path) -> Trained:

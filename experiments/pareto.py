@@ -34,6 +34,7 @@ from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.evaluate import camera_of, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.render.frame import Frame, frame_config, render_frame, to_image
+from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.types import Camera, NeuralImpostor
 
 matplotlib.use("Agg")
@@ -68,7 +69,8 @@ def main(argv: Sequence[str]) -> None:
     cameras = [camera_of(test, view) for view in views]
     background = 1.0 if config.data.background == "white" else 0.0
     truths = [test.images[v][..., :3] + background * (1 - test.images[v][..., 3:]) for v in views]
-    settings = [s for s in levers(config.render) if not args.only or s[0] in [*args.only, "default"]]
+    render = with_step(config.render, impostor.config.encoding)
+    settings = [s for s in levers(render) if not args.only or s[0] in [*args.only, "default"]]
 
     def reference(impostor: NeuralImpostor, render: RenderConfig) -> list[np.ndarray]:
         return [to_image(reference_frame(impostor, camera, render), background) for camera in cameras]

@@ -81,7 +81,7 @@ EXPERIMENTS = st.builds(
         (SamplerConfig, "cone_angle", -0.1),
         (SamplerConfig, "max_samples_per_ray", 0),
         (SamplerConfig, "capacity_per_ray", 0),
-        (SamplerConfig, "capacity_per_ray", 129),  # above max_samples_per_ray
+        (SamplerConfig, "capacity_per_ray", 257),  # above max_samples_per_ray
         (RenderConfig, "density_measure", "alpha"),
         (RenderConfig, "near", -1.0),
         (DataConfig, "resolution", 7),

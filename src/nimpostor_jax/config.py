@@ -150,13 +150,14 @@ class SamplerConfig:
     """Placement of samples along a ray (Eqs. 3 to 5).
 
     `step` is in units of `measure`: L1 barycentric distance (2 is a whole crossing, vertex to face), tets
-    crossed (`alpha`, Eq. 4 as printed), or length (`euclidean`, in units of the cage's own frame).
+    crossed (`alpha`, Eq. 4 as printed), or length (`euclidean`, in units of the cage's own frame). Without
+    one, steps cross about two cells of the field's finest level (`render.sampling.with_step`).
     """
 
     measure: Measure = "barycentric"
-    step: float = 0.125
+    step: float | None = None
     cone_angle: float = 0.0  # theta of Eq. 4: step growth per unit of measure travelled
-    max_samples_per_ray: int = 128  # S; a longer ray gets larger steps and is reported
+    max_samples_per_ray: int = 256  # S; a longer ray gets larger steps and is reported
     capacity_per_ray: int | None = (
         None  # mean samples a ray in the packed buffer; None: S, no packing
     )
@@ -169,7 +170,9 @@ class SamplerConfig:
             "measure",
             f"one of {typing.get_args(Measure)}",
         )
-        _require(self.step > 0 and math.isfinite(self.step), self, "step", "> 0")
+        _require(
+            self.step is None or (self.step > 0 and math.isfinite(self.step)), self, "step", "None or > 0"
+        )
         _require(self.cone_angle >= 0, self, "cone_angle", ">= 0")
         _require(self.max_samples_per_ray >= 1, self, "max_samples_per_ray", ">= 1")
         _require(

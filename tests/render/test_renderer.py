@@ -101,6 +101,14 @@ def test_agrees_with_a_loop_over_samples(integrate, x64):
     assert np.std(output.opacity) > 0.05
 
 
+def test_without_a_step_the_fields_cells_say_how_long_it_is():
+    impostor = scenes.impostor()
+    assert max(impostor.config.encoding.resolutions) == 3  # two cells are more than the most of a step, 1/2
+    rays = as_rays(rays_at(impostor))
+    fitted = render(impostor, rays, exact(step=None))
+    assert jax.tree.all(jax.tree.map(np.array_equal, fitted, render(impostor, rays, exact(step=0.5))))
+
+
 def test_rays_that_miss_are_exactly_transparent():
     impostor = scenes.impostor()
     output = render(impostor, as_rays(rays_at(impostor, missing)), RENDER)

@@ -13,12 +13,13 @@ from meshes import local_vertices, tet_mesh
 from numpy.testing import assert_allclose, assert_array_equal
 from rays import as_rays, by_ray, generic, missing
 
-from nimpostor_jax.config import MarchConfig, SamplerConfig
+from nimpostor_jax.config import EncodingConfig, MarchConfig, RenderConfig, SamplerConfig
 from nimpostor_jax.render.sampling import (
     place_samples,
     plan_samples,
     segment_measure,
     step_boundaries,
+    with_step,
 )
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
@@ -170,6 +171,24 @@ def test_cone_steps_follow_equation_4():
     deltas = used(sample(segments_of([(0, 0.0, 3.0)]), config, "euclidean"))["deltas"]
     sizes = np.diff(step_boundaries(config))[: len(deltas)]
     assert_allclose(deltas / deltas[0], sizes / sizes[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("measure, tet", [("barycentric", 2.0), ("alpha", 1.0)])
+def test_without_a_step_it_crosses_two_cells_of_the_finest_level(measure, tet):
+    config = RenderConfig(sampler=SamplerConfig(measure=measure))
+    for resolution, cells in ((32, 2), (8, 2), (4, 1), (1, 0.25)):  # at least four steps a tet
+        step = with_step(config, EncodingConfig(num_levels=1, base_resolution=resolution)).sampler.step
+        assert step == cells * tet / resolution
+
+
+def test_a_step_of_its_own_is_kept_and_one_that_is_not_known_is_asked_for():
+    own = RenderConfig(sampler=SamplerConfig(step=0.3, measure="euclidean"))
+    assert with_step(own, EncodingConfig()) is own
+    for sampler, layout in ((SamplerConfig(measure="euclidean"), "per_tet"), (SamplerConfig(), "box")):
+        with pytest.raises(ValueError, match=r"SamplerConfig\.step must be given"):
+            with_step(RenderConfig(sampler=sampler), EncodingConfig(layout=layout))
+    with pytest.raises(ValueError, match="with_step"):
+        step_boundaries(SamplerConfig())
 
 
 def test_long_rays_are_coarsened_and_say_so():

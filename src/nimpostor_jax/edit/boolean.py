@@ -16,15 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.config import SamplerConfig
 from nimpostor_jax.edit.compose import compose, object_tets
 from nimpostor_jax.field.solids import CLOSED, MIXED, OPEN
 from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
 from nimpostor_jax.types import FunctionSolid, Gate, GridSolid, ImpostorSolid, NeuralImpostor, Solid
 
 Choice = Literal["first", "second", "blend"]
+STEP = 0.125  # in barycentric units, a sixteenth of a way across a tet
 THRESHOLD = 0.02  # optical depth of a step of `STEP`
-STEP = SamplerConfig().step
 COARSE_CELLS = 64  # a side, of the grid on which tets are told apart
 
 

@@ -21,6 +21,7 @@ from nimpostor_jax.pipeline.prepare import Log, Scene
 from nimpostor_jax.render.baked import BASIS
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.frame import refined
+from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.bake import (
     Moments,
@@ -65,7 +66,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     )
     key = jax.random.key(train.seed + 2)
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
-    render = fit_config(mesh, pool, probe, scene.config.render)
+    render = fit_config(mesh, pool, probe, with_step(scene.config.render, impostor.config.encoding))
 
     def batches(share: float, text: str) -> Iterator[RayBatch]:
         count = -(-round(share * config.fit_rays) // len(probe.jitter))

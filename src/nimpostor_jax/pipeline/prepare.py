@@ -26,6 +26,7 @@ from nimpostor_jax.preprocess.validate import (
     quality_report,
 )
 from nimpostor_jax.render.capacity import fit_capacities
+from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
 from nimpostor_jax.types import NeuralImpostor
@@ -132,7 +133,7 @@ def prepare_views(
     probe = draw_batch(key, 0, pool, min(config.train.rays_per_batch, 8192), "white")
     entries = pool.entries.holds.shape[1]
     march = dataclasses.replace(config.render.march, max_entries_per_ray=entries)
-    render = dataclasses.replace(config.render, march=march)
+    render = with_step(dataclasses.replace(config.render, march=march), config.impostor.encoding)
     render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, render)
     return Scene(config=config, train=train, test=test, impostor=impostor, pool=pool, render=render)
 

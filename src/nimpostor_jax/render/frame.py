@@ -17,6 +17,7 @@ from nimpostor_jax.render.baked import render_baked_rays
 from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, all_entries, fit_capacities, grow_march, ray_entries
 from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables
 from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor, Rays, RenderOutput, TetMesh
 
@@ -66,7 +67,7 @@ def frame_config(
     Sizes are measured on pixels spread over those that hit the cage. What overflows nevertheless,
     `render_frame` renders again.
     """
-    config = refined(config)
+    config = refined(with_step(config, impostor.config.encoding))
     tables = _march_tables(impostor.mesh)
     rays = _tiled_rays(camera, camera.height, camera.width)
     entries, march = all_entries(impostor.mesh, tables, rays, config.march)
@@ -81,8 +82,9 @@ def frame_config(
 
 
 def refined(config: RenderConfig) -> RenderConfig:
-    """With the steps of frames; once is enough."""
+    """A config that has a step with the steps of frames; once is enough."""
     factor, sampler = config.frame_refinement, config.sampler
+    assert sampler.step is not None
     most = math.ceil(factor * sampler.max_samples_per_ray)
     mean = sampler.capacity_per_ray and math.ceil(factor * sampler.capacity_per_ray)
     sampler = dataclasses.replace(
@@ -118,7 +120,8 @@ def render_frame(
     coarse quadratures may miss the same detail. Samples below a 32nd of the tolerance are left out, and those
     below `min_weight`. Raises ValueError for a tolerance that is not positive.
     """
-    height, width, config = camera.height, camera.width, refined(config)
+    height, width = camera.height, camera.width
+    config = refined(with_step(config, impostor.config.encoding))
     if tolerance is not None:
         if not tolerance > 0:
             raise ValueError(f"tolerance must be > 0, got {tolerance}")

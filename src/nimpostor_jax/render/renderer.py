@@ -13,7 +13,7 @@ from nimpostor_jax.field.decoder import Parameters, decode_appearance, num_decod
 from nimpostor_jax.field.solids import painted
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sum_by_ray
-from nimpostor_jax.render.sampling import Samples, place_samples, plan_samples
+from nimpostor_jax.render.sampling import Samples, place_samples, plan_samples, with_step
 from nimpostor_jax.render.segments import in_cells, march_segments
 from nimpostor_jax.render.selection import (
     optical_weights,
@@ -56,6 +56,7 @@ def render_samples(
     refinement: Float[Array, " R"] | None = None,
 ) -> tuple[RenderOutput, Samples]:
     """`render_rays`, and the samples of which the colours are made."""
+    config = with_step(config, impostor.config.encoding)
     local = to_local(impostor.mesh, rays)
     segments = march_segments(impostor.mesh, local, config, tables, entries)
     segments = in_cells(segments, impostor.embedding)

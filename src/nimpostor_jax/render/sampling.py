@@ -16,11 +16,13 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.chunks import default_chunk, map_used, running
-from nimpostor_jax.config import Measure, SamplerConfig
+from nimpostor_jax.config import EncodingConfig, Measure, RenderConfig, SamplerConfig
 from nimpostor_jax.render.composite import sum_before
 from nimpostor_jax.types import TetSegments
 
 GOLDEN_RATIO = 0.6180339887498949
+STEP_CELLS = 2.0  # of the field's finest level that a step crosses
+MAX_STEP = 0.5  # at least four samples across a tet
 
 
 @struct.dataclass
@@ -65,8 +67,31 @@ def segment_measure(segments: TetSegments, measure: Measure) -> Float[Array, " N
     return segments.t_exit - segments.t_enter
 
 
+def with_step(config: RenderConfig, field: EncodingConfig) -> RenderConfig:
+    """The config with a step: its own, or one that crosses `STEP_CELLS` cells of the field's finest level.
+
+    A field cannot show more than its finest cells do, which training fits to its pixels. Raises ValueError
+    where the field's cells do not say how long a step is in the sampler's measure.
+    """
+    sampler = config.sampler
+    if sampler.step is not None:
+        return config
+    if sampler.measure == "euclidean" or field.layout == "box":
+        raise ValueError(
+            "SamplerConfig.step must be given for measure 'euclidean' and for EncodingConfig.layout 'box'"
+        )
+    tet = 2.0 if sampler.measure == "barycentric" else 1.0  # measure of a whole crossing
+    step = tet * min(STEP_CELLS / max(field.resolutions), MAX_STEP / 2)
+    return dataclasses.replace(config, sampler=dataclasses.replace(sampler, step=step))
+
+
 def step_boundaries(config: SamplerConfig) -> np.ndarray:
-    """Distances from the first tet's entry at which steps end, [S + 1], before fitting to a ray (Eq. 4)."""
+    """Distances from the first tet's entry at which steps end, [S + 1], before fitting to a ray (Eq. 4).
+
+    Raises ValueError for a config without a step (`with_step`).
+    """
+    if config.step is None:
+        raise ValueError("SamplerConfig.step is not known without a field; see render.sampling.with_step")
     step, travelled = config.step, [0.0]
     for _ in range(config.max_samples_per_ray):
         travelled.append(travelled[-1] + step)
@@ -195,7 +220,7 @@ def _samples_before(
     rays = segments.rays
     position = starts / jnp.where(scale > 0, scale, 1)[rays]
     if config.cone_angle == 0:
-        step = (position / config.step).astype(jnp.int32)
+        step = (position / boundaries[1]).astype(jnp.int32)
     else:
         step = jnp.searchsorted(boundaries, position, side="right").astype(jnp.int32) - 1
     step = jnp.clip(step, 0, boundaries.size - 2)

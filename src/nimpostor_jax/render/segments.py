@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import running
+from nimpostor_jax.chunks import default_chunk, map_used, running
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.geometry.intersect import face_weights, project, ray_frame
 from nimpostor_jax.geometry.tetrahedron import FACES
@@ -29,6 +29,7 @@ from nimpostor_jax.render.traverse import (
 )
 from nimpostor_jax.types import Embedding, Rays, TetMesh, TetSegments
 
+DERIVED_CHUNK = 64  # segments that CPUs differentiate at a time: all at once take twenty times as long
 ROUNDING = 8  # units in the last place of t by which a walk may go back unnoticed
 _CODES = np.arange(CODES_PER_TET)
 ENTRY_TRIANGLES = np.array([np.roll(FACES[c // 9], -(c // 3 % 3)) for c in _CODES], np.int32)
@@ -175,7 +176,7 @@ def _covered(
     return jax.lax.cond(jnp.any(used & (t_enter - t_exit > rounding)), furthest, lambda: t_enter)
 
 
-@jax.custom_jvp
+@jax.custom_vjp
 def _ends(
     geometry: tuple,
     tets: Int[Array, "T 4"],
@@ -192,11 +193,19 @@ def _ends(
     return ends[0], ends[3], lambdas[0], lambdas[1]
 
 
-@_ends.defjvp
-def _ends_jvp(primals: tuple, tangents: tuple) -> tuple[Ends, Ends]:
-    geometry, tets, rays, codes, _ = primals
-    _, tangents_out = jax.jvp(lambda g: _recomputed_ends(g, tets, rays, codes), (geometry,), (tangents[0],))
-    return _ends(*primals), tangents_out
+def _ends_forward(
+    geometry: tuple, tets: Array, rays: Array, codes: Array, ends: tuple[Array, ...]
+) -> tuple[Ends, tuple]:
+    return _ends(geometry, tets, rays, codes, ends), (geometry, tets, rays, codes)
+
+
+def _ends_backward(arguments: tuple, cotangents: Ends) -> tuple:
+    geometry, *constants = arguments
+    _, pull = jax.vjp(lambda moving: _recomputed_ends(moving, *constants), geometry)
+    return *pull(cotangents), None, None, None, None
+
+
+_ends.defvjp(_ends_forward, _ends_backward)
 
 
 def _recomputed_ends(
@@ -204,19 +213,27 @@ def _recomputed_ends(
 ) -> Ends:
     """What the march computed, as a differentiable function of vertices, origins and directions."""
     vertices, origins, directions = geometry
-    codes = jnp.maximum(codes, 0)
+    codes, count = jnp.maximum(codes, 0), jnp.int32(len(codes))
     tet_ids, local = codes // CODES_PER_TET, codes % CODES_PER_TET
-    origin, direction = (tuple(x[rays, i] for i in range(3)) for x in (origins, directions))
-    axes = ray_frame(direction)
     ts, lambdas = [], []
     for triangles in (ENTRY_TRIANGLES, EXIT_TRIANGLES):
         triangle = jnp.asarray(triangles)[local]
-        corners = [vertices[tets[tet_ids, triangle[..., j]]] for j in range(3)]
-        a, b, c = (project(tuple(corner[..., i] for i in range(3)), origin, axes) for corner in corners)
-        wa, wb, wc = face_weights(a, b, c)
-        ts.append(wa * a[2] + wb * b[2] + wc * c[2])
+        corners = vertices[jnp.take_along_axis(tets[tet_ids], triangle, axis=1)]
+        items, chunk = (corners, origins[rays], directions[rays]), default_chunk(len(codes), DERIVED_CHUNK)
+        t, wa, wb = map_used(_place_in_face, None, items, count, chunk)
+        ts.append(t)
         lambdas.append(_spread(triangle, wa, wb))
     return ts[0], ts[1], lambdas[0], lambdas[1]
+
+
+def _place_in_face(_: None, items: tuple) -> tuple[Float[Array, " n"], ...]:
+    """t at which rays pass faces, and the weights of the first two corners there."""
+    corners, origins, directions = items
+    origin, direction = (tuple(x[..., i] for i in range(3)) for x in (origins, directions))
+    axes = ray_frame(direction)
+    a, b, c = (project(tuple(corners[..., j, i] for i in range(3)), origin, axes) for j in range(3))
+    wa, wb, wc = face_weights(a, b, c)
+    return wa * a[2] + wb * b[2] + wc * c[2], wa, wb
 
 
 def _spread(
