@@ -17,9 +17,9 @@ from jaxtyping import Array, Bool, Int
 CPU_CHUNK = 4096  # items; accelerators want few large kernels and take all at once
 
 
-def default_chunk(num_items: int, on_cpu: int = CPU_CHUNK) -> int:
-    """Items a chunk on this back end, at least 1."""
-    return max(1, min(num_items, on_cpu) if jax.default_backend() == "cpu" else num_items)
+def default_chunk(num_items: int, on_cpu: int | None = None) -> int:
+    """Items a chunk on this back end, at least 1; on CPUs the given number, or `CPU_CHUNK`."""
+    return max(1, min(num_items, on_cpu or CPU_CHUNK) if jax.default_backend() == "cpu" else num_items)
 
 
 def padded_size(num_items: int, chunk: int) -> int:

@@ -18,13 +18,14 @@ from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.sampling import plan_samples, segment_measure, step_boundaries
 from nimpostor_jax.render.segments import in_cells, locate_segments
-from nimpostor_jax.render.selection import present_samples
+from nimpostor_jax.render.selection import present_samples, visible_samples
 from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
 
 # A chunk of a frame is 32 image tiles from all over it, whose mean varies by a tenth. Room that is not used
 # costs next to nothing; rays that do not fit cost a second program.
 SHARED_MARGIN = 1.4
+ONE_PASS = 0.4  # share of visible samples above which a pass that tells them apart does not pay
 MAX_GROWTH = 6  # doublings of a buffer before giving up
 
 
@@ -55,6 +56,7 @@ class _Demand(NamedTuple):
     overflow: Bool[Array, ""]  # some did not fit
     total: Float[Array, " R"]  # each ray's measure
     occupied: Int[Array, ""] | None  # samples in occupied cells
+    visible: Int[Array, ""] | None  # of these, samples that contribute `min_weight`
 
 
 @partial(jax.jit, static_argnames="config")
@@ -66,16 +68,20 @@ def _demand(
     segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
     measure = segment_measure(segments, config.sampler.measure)
     total = jax.ops.segment_sum(measure, segments.rays, rays.origins.shape[0])
-    occupied = None
+    occupied, visible = None, None
     if field is not None:
         sampler = dataclasses.replace(config.sampler, capacity_per_ray=None, occupied_per_ray=None)
         plan = plan_samples(in_cells(segments, field.embedding), sampler, config.density_measure)
-        _, _, occupied = present_samples(field, plan, dataclasses.replace(config, sampler=sampler))
+        roomy = dataclasses.replace(config, sampler=sampler)
+        plan, chosen, occupied = present_samples(field, plan, roomy)
+        if config.min_weight > 0:
+            _, _, visible = visible_samples(field, plan, chosen, occupied, config, None)
     return _Demand(
         tets=jnp.sum(crossings.codes >= 0, axis=0),
         overflow=jnp.any(crossings.overflow),
         total=total,
         occupied=occupied,
+        visible=visible,
     )
 
 
@@ -92,7 +98,8 @@ def fit_capacities(
 
     `margin` is that of a single ray's slots; buffers that rays share have `SHARED_MARGIN`. Slots are rounded
     up to multiples of 8; `max_samples_per_ray` of the given config stays the limit. With a trained `field`,
-    the buffers behind its occupancy are fitted too.
+    the buffers behind its occupancy are fitted too, and `min_weight` is set to 0 where finding out which
+    samples are visible would cost more than it spares (`ONE_PASS`).
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
     if field is not None and (field.occupied is None or not config.skip_empty) and not field.gates:
@@ -124,7 +131,13 @@ def fit_capacities(
         capacity_per_ray=min(most, _mean(wanted)),
         occupied_per_ray=None if field is None else _mean(np.asarray(demand.occupied) / len(total)),
     )
-    return dataclasses.replace(config, march=march, sampler=sampler)
+    config = dataclasses.replace(config, march=march, sampler=sampler)
+    if demand.visible is not None:
+        # Where features are integrated, samples have no colours to spare.
+        share = 0.0 if config.integrate == "features" else ONE_PASS
+        if int(demand.visible) > share * int(demand.occupied):
+            config = dataclasses.replace(config, min_weight=0.0)
+    return config
 
 
 def grow_march(config: RenderConfig) -> RenderConfig:
