@@ -44,7 +44,7 @@ from nimpostor_jax.render.traverse import march_tables, traverse
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
 from nimpostor_jax.train.step import init_state, make_optimizer, train_step
-from nimpostor_jax.types import Camera, NeuralImpostor
+from nimpostor_jax.types import Camera, NeuralImpostor, Rays
 
 
 def main(argv: Sequence[str]) -> None:
@@ -108,8 +108,8 @@ def show(row: Row) -> Row:
 def time_own(
     scene: Scene, name: str, trained: NeuralImpostor | None, args: argparse.Namespace
 ) -> dict[str, Any]:
-    """Ours alone: marching, training steps, a frame, and peak memory."""
-    rows = [time_traversal(scene, args.repeats)]
+    """Ours alone: marching, derivatives of the geometry, training steps, a frame, and peak memory."""
+    rows = [time_traversal(scene, args.repeats), time_geometry(scene, args.repeats)]
     for interpolation, min_weight in (("grid", 0.0), ("grid", None), ("simplex", None)):
         config = scene.render
         if min_weight is not None:
@@ -149,6 +149,29 @@ def time_traversal(scene: Scene, repeats: int) -> Row:
         "compile_s": first - median,
         "rays": rays.origins.shape[0],
         "ns_per_segment": 1e9 * median / segments,
+    }
+
+
+def time_geometry(scene: Scene, repeats: int) -> Row:
+    """The gradient of a training batch's segments in the cage's vertices and in the rays, on one device."""
+    mesh, march = scene.impostor.mesh, scene.render.march
+    batch = draw_batch(jax.random.key(0), 0, scene.pool, scene.config.train.rays_per_batch, "white")
+    rays = to_local(mesh, batch.rays)
+    crossings = jax.jit(traverse, static_argnums=2)(march_tables(mesh), rays, march)
+    capacity = (march.capacity_per_ray or march.max_tets_per_ray) * rays.origins.shape[0]
+
+    @jax.jit
+    @partial(jax.grad, argnums=(0, 1))
+    def gradient(vertices: jax.Array, rays: Rays) -> jax.Array:
+        found = locate_segments(mesh.replace(vertices=vertices), rays, crossings, capacity=capacity)
+        return jnp.sum(found.t_exit**2) + jnp.sum(found.lambda_enter**2) + jnp.sum(found.lambda_exit**2)
+
+    first, median = measure(lambda: gradient(mesh.vertices, rays), repeats)
+    return {
+        "name": "gradient_of_geometry",
+        "ms": 1e3 * median,
+        "compile_s": first - median,
+        "ns_per_segment": 1e9 * median / int((crossings.codes >= 0).sum()),
     }
 
 
@@ -222,24 +245,27 @@ def first_camera(scene: Scene, size: int) -> Camera:
 def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int) -> list[Row]:
     """A frame of the first test camera, and what it would cost without each skip, in turns.
 
+    One pass gives every sample a colour, and two only those that a pass of densities finds visible.
+
     `psnr_to_exact` compares with the frame of every sample of every pixel: what the skips change.
     """
     camera = first_camera(scene, size)
     full = scene.config.render
-    everything = dataclasses.replace(full, skip_empty=False, min_weight=0.0)
+    every_cell = dataclasses.replace(full, skip_empty=False)
     merged = for_frames(impostor)
-    settings = {
-        "": (merged, full, False),
-        "_with_single_levels": (impostor, full, False),
-        "_with_empty_cells": (merged, dataclasses.replace(full, skip_empty=False), False),
-        "_with_invisible_samples": (merged, dataclasses.replace(full, min_weight=0.0), False),
-        "_with_empty_pixels": (merged, full, True),
-        "_with_everything": (impostor, everything, True),
+    settings: dict[str, tuple[NeuralImpostor, RenderConfig, dict[str, float], bool]] = {
+        "": (merged, full, {}, False),
+        "_with_single_levels": (impostor, full, {}, False),
+        "_with_empty_cells": (merged, every_cell, {}, False),
+        "_in_one_pass": (merged, full, {"min_weight": 0.0}, False),
+        "_in_two_passes": (merged, full, {"min_weight": full.min_weight / full.frame_refinement}, False),
+        "_with_empty_pixels": (merged, full, {}, True),
+        "_with_everything": (impostor, every_cell, {"min_weight": 0.0}, True),
     }
     calls, images, times = {}, {}, {}
     pixels = np.arange(camera.width * camera.height)
-    for name, (field, config, all_pixels) in settings.items():
-        config = frame_config(field, camera, config)
+    for name, (field, config, passes, all_pixels) in settings.items():
+        config = dataclasses.replace(frame_config(field, camera, config), **passes)
         if all_pixels:
             calls[name] = lambda field=field, config=config: View(field, camera, config).render(pixels)
         else:
@@ -259,7 +285,7 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
             "name": f"frame_{camera.width}x{camera.height}{name}",
             "ms": 1e3 * float(np.median(times[name][1:])),
             "compile_s": times[name][0] - float(np.median(times[name][1:])),
-            "psnr_to_exact": None if settings[name][1] is everything
+            "psnr_to_exact": None if name == "_with_everything"
             else float(psnr(images[name], images["_with_everything"])),
         }
         for name in settings
