@@ -24,7 +24,6 @@ SMALL = [
     "CageConfig.target_tets=100",
     "CageConfig.grid_resolution=48",
     "EncodingConfig.num_levels=3",
-    "SamplerConfig.step=0.25",
     "TrainConfig.steps=20",
     "TrainConfig.rays_per_batch=512",
 ]

@@ -32,6 +32,7 @@ from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import to_cells
 from nimpostor_jax.geometry.locate import LocateTables, locate_tables
 from nimpostor_jax.render.capacity import fit_capacities
+from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.sharding import AXIS, data_parallel, device_mesh, over_rays, replicated
@@ -142,7 +143,7 @@ def _render_stage(
     pool, key, losses = pictures_of(old, new, region, render, config), jax.random.key(config.seed + 1), []
     probe = draw_batch(key, 0, pool, min(PROBE_RAYS, config.rays_per_batch), "random")
     march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.holds.shape[1])
-    sized = dataclasses.replace(render, march=march)
+    sized = with_step(dataclasses.replace(render, march=march), new.config.encoding)
     sized = fit_capacities(new.mesh, jax.jit(march_tables)(new.mesh), probe.rays, sized)
     gradient, place = loss_gradient, (lambda batch: batch)
     devices = jax.local_devices()
