@@ -22,7 +22,7 @@ from peers_match import (
     spread,
 )
 
-from nimpostor_jax.config import ImpostorConfig, RenderConfig
+from nimpostor_jax.config import ImpostorConfig, RenderConfig, SamplerConfig
 from nimpostor_jax.field.impostor import init_impostor
 from nimpostor_jax.geometry.locate import find_tets, locate_tables
 from nimpostor_jax.geometry.tetrahedron import FACES
@@ -35,6 +35,7 @@ from nimpostor_jax.render.frame import Frame, for_frames, frame_config, render_f
 from nimpostor_jax.render.traverse import Crossings, march_tables, traverse
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays, TetMesh
 
+STEPS = RenderConfig(sampler=SamplerConfig(step=0.125))  # of a field that is not trained for any pixels
 CROSSINGS = Crossings(codes=P(None, *SPLIT), ends=(P(None, *SPLIT),) * 6, overflow=SPLIT)
 LOST = 1e-4  # of the ball's radius: a ray that is shorter or longer by more has lost or doubled a segment
 ROUNDING = 1e-6  # how far float32 moves a ray that starts a few radii away
@@ -185,7 +186,7 @@ def _marching(mesh: TetMesh, rays: Rays, threads: int = CORES) -> Callable[[], C
     tables = jax.jit(march_tables)(mesh)
     count = len(rays.origins)
     probe = jax.tree.map(lambda x: x[:: max(1, count // 8192)], rays)
-    config = fit_capacities(mesh, tables, probe, RenderConfig()).march
+    config = fit_capacities(mesh, tables, probe, STEPS).march
     local = jax.jit(to_local)(mesh, rays)
     return spread(lambda shared, items: traverse(shared, items, config), tables, local, CROSSINGS, threads)
 
@@ -242,7 +243,7 @@ def frame_vs_vtk(work: Work) -> Match:
     """An untrained impostor on the ball, against VTK's ray caster on one scalar at the same vertices."""
     mesh = cage_of(work)[2]
     impostor = init_impostor(jax.random.key(0), mesh, ImpostorConfig())
-    return _against_vtk(impostor, front_camera(work.frame_size), RenderConfig())
+    return _against_vtk(impostor, front_camera(work.frame_size), STEPS)
 
 
 def frame_trained_vs_vtk(work: Work) -> Match:
