@@ -29,7 +29,7 @@ from nimpostor_jax.render.traverse import (
 )
 from nimpostor_jax.types import Embedding, Rays, TetMesh, TetSegments
 
-DERIVED_CHUNK = 64  # segments that CPUs differentiate at a time: all at once take twenty times as long
+DERIVED_CHUNK = 64  # segments that CPUs differentiate at a time: all at once take several times as long
 ROUNDING = 8  # units in the last place of t by which a walk may go back unnoticed
 _CODES = np.arange(CODES_PER_TET)
 ENTRY_TRIANGLES = np.array([np.roll(FACES[c // 9], -(c // 3 % 3)) for c in _CODES], np.int32)
