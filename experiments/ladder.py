@@ -59,7 +59,7 @@ class Trained(NamedTuple):
 def config_of(
     method: str, resolution: int, configs: Sequence[Path], bindings: Sequence[str]
 ) -> ExperimentConfig:
-    """A method's config at an image width, with `CURVE_POINTS`; the caller's files override its own."""
+    """A method's config at an image width, from the caller's files and bindings, with `CURVE_POINTS`."""
     files = [CONFIGS / f"{METHODS[method]}.gin", *configs]
     bindings = [f"DataConfig.resolution={resolution}", *bindings]
     every = max(1, load_config(files, bindings).train.steps // CURVE_POINTS)

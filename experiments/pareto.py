@@ -85,7 +85,10 @@ def main(argv: Sequence[str]) -> None:
     rows = []
     for lever, value, render in settings:
         shown = impostors.get(lever, impostor)
-        render = frame_config(shown, cameras[0], render)
+        sized = frame_config(shown, cameras[0], render)
+        if lever == "min_weight":  # which frames of mostly visible samples leave out
+            sized = dataclasses.replace(sized, min_weight=render.min_weight / render.frame_refinement)
+        render = sized
         tolerance = value if lever == "tolerance" else None
         frames = [render_frame(shown, camera, render, tolerance) for camera in cameras]
         images = [to_image(frame, background) for frame in frames]

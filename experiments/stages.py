@@ -116,9 +116,11 @@ def render_stages(
     plan = stage("plan", lambda s: plan_samples(s, config.sampler, config.density_measure, jitter), segments)
     plan, chosen, count = stage("cells", lambda i, p: present_samples(i, p, config), impostor, plan)
     numbers = {"planned": int(plan.num_used), "in occupied cells": int(count)}
-    chosen, features, count = stage(
-        "visible", lambda i, p, c, n: visible_samples(i, p, c, n, config, None), impostor, plan, chosen, count
-    )
+    features = None
+    if config.min_weight > 0:
+        look = lambda i, p, c, n: visible_samples(i, p, c, n, config, None)  # noqa: E731
+        chosen, features, count = stage("visible", look, impostor, plan, chosen, count)
+        numbers["visible"] = int(count)
     samples = stage("place", place_samples, plan, chosen, count)
     stage(
         "colours",
@@ -126,8 +128,8 @@ def render_stages(
         impostor, local, samples, features, segments.overflow,
     )  # fmt: skip
     stage("all", lambda i, r, t, e: render_rays(i, r, config, jitter, t, e), impostor, rays, tables, entries)
-    print(f"{kind}: samples {numbers | {'visible': int(count)}}")
-    return [row | {"samples": numbers | {"visible": int(count)}} for row in rows]
+    print(f"{kind}: samples {numbers}")
+    return [row | {"samples": numbers} for row in rows]
 
 
 def training_stages(impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig) -> list[Row]:

@@ -45,7 +45,7 @@ EXPERIMENTS = st.builds(
     render=st.builds(
         RenderConfig,
         march=st.builds(MarchConfig, tile_size=st.none() | st.integers(1, 512)),
-        sampler=st.builds(SamplerConfig, step=POSITIVE, capacity_per_ray=st.integers(1, 128)),
+        sampler=st.builds(SamplerConfig, step=st.none() | POSITIVE, capacity_per_ray=st.integers(1, 256)),
         near=st.floats(0, 10),
     ),
     train=st.builds(TrainConfig, steps=st.integers(1, 10**6), learning_rate=POSITIVE),

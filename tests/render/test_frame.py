@@ -211,8 +211,9 @@ def test_frames_look_for_visible_samples_where_few_are(scene, bias, passes):
     impostor = impostor.replace(occupied=jnp.ones((len(impostor.mesh.tets), num_cells(2)), bool))
     sized = frame_config(impostor, camera, exact(step=0.1, max_samples_per_ray=64, min_weight=1e-3))
     assert sized.min_weight == (0 if passes == 1 else 1e-3)
-    integrated = dataclasses.replace(sized, min_weight=1e-3, integrate="features")
-    assert frame_config(impostor, camera, integrated).min_weight == 0
+    for empty in (True, False):
+        integrated = dataclasses.replace(sized, min_weight=1e-3, integrate="features", skip_empty=empty)
+        assert frame_config(impostor, camera, integrated).min_weight == 0
 
 
 def test_to_image_blends_and_clips():

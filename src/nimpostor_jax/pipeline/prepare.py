@@ -104,10 +104,12 @@ def prepare(
     The cage is saved as `cage_output`, unless there is one. All input is checked before anything long starts.
 
     Raises:
-        FileNotFoundError, ValueError: missing or inconsistent data, empty masks, a bad cage, or a cage that
-            more than `CageConfig.max_missed_share` of the foreground's rays miss.
+        FileNotFoundError, ValueError: a sampler that needs a step and has none (`sampling.with_step`),
+            missing or inconsistent data, empty masks, a bad cage, or a cage that more than
+            `CageConfig.max_missed_share` of the foreground's rays miss.
     """
     warn_of_slow_scatter()
+    with_step(config.render, config.impostor.encoding)  # asks for a step where there must be one
     train, test = load_scene(resolve_scene(data), config.data)
     log(f"{data}: {len(train)} training views, {len(test)} test views, {train.width} x {train.height}")
     built = load_cage(config, train, cage, cage_output, log)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.sampling import plan_samples, segment_measure, step_boundaries
-from nimpostor_jax.render.segments import in_cells, locate_segments
+from nimpostor_jax.render.segments import in_cells, locate_segments, march_segments
 from nimpostor_jax.render.selection import present_samples, visible_samples
 from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
@@ -26,6 +26,7 @@ from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
 # costs next to nothing; rays that do not fit cost a second program.
 SHARED_MARGIN = 1.4
 ONE_PASS = 0.4  # share of visible samples above which a pass that tells them apart does not pay
+VISIBLE_EVERY = 8  # of the sample rays: that pass needs features, the others only numbers
 MAX_GROWTH = 6  # doublings of a buffer before giving up
 
 
@@ -56,7 +57,6 @@ class _Demand(NamedTuple):
     overflow: Bool[Array, ""]  # some did not fit
     total: Float[Array, " R"]  # each ray's measure
     occupied: Int[Array, ""] | None  # samples in occupied cells
-    visible: Int[Array, ""] | None  # of these, samples that contribute `min_weight`
 
 
 @partial(jax.jit, static_argnames="config")
@@ -68,21 +68,29 @@ def _demand(
     segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
     measure = segment_measure(segments, config.sampler.measure)
     total = jax.ops.segment_sum(measure, segments.rays, rays.origins.shape[0])
-    occupied, visible = None, None
+    occupied = None
     if field is not None:
         sampler = dataclasses.replace(config.sampler, capacity_per_ray=None, occupied_per_ray=None)
         plan = plan_samples(in_cells(segments, field.embedding), sampler, config.density_measure)
-        roomy = dataclasses.replace(config, sampler=sampler)
-        plan, chosen, occupied = present_samples(field, plan, roomy)
-        if config.min_weight > 0:
-            _, _, visible = visible_samples(field, plan, chosen, occupied, config, None)
+        _, _, occupied = present_samples(field, plan, dataclasses.replace(config, sampler=sampler))
     return _Demand(
         tets=jnp.sum(crossings.codes >= 0, axis=0),
         overflow=jnp.any(crossings.overflow),
         total=total,
         occupied=occupied,
-        visible=visible,
     )
+
+
+@partial(jax.jit, static_argnames="config")
+def _visible_share(
+    field: NeuralImpostor, tables: MarchTables, rays: Rays, config: RenderConfig
+) -> Float[Array, ""]:
+    """Of the samples that may be seen, the share that contributes `min_weight`; in buffers that fit."""
+    segments = march_segments(field.mesh, to_local(field.mesh, rays), config, tables)
+    plan = plan_samples(in_cells(segments, field.embedding), config.sampler, config.density_measure)
+    plan, chosen, present = present_samples(field, plan, config)
+    _, _, visible = visible_samples(field, plan, chosen, present, config, None)
+    return visible / jnp.maximum(present, 1)
 
 
 def fit_capacities(
@@ -97,11 +105,12 @@ def fit_capacities(
     """A config whose buffers hold these sample rays (drawn like those to come), with a margin.
 
     `margin` is that of a single ray's slots; buffers that rays share have `SHARED_MARGIN`. Slots are rounded
-    up to multiples of 8; `max_samples_per_ray` of the given config stays the limit. With a trained `field`,
-    the buffers behind its occupancy are fitted too, and `min_weight` is set to 0 where finding out which
-    samples are visible would cost more than it spares (`ONE_PASS`).
+    up to multiples of 8; `max_samples_per_ray` of the given config stays the limit. With a `field`, for
+    frames of it, the buffers behind its occupancy are fitted too, and `min_weight` is set to 0 where finding
+    out which samples are visible would cost more than it spares (`ONE_PASS`).
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
+    of_frames = field is not None
     if field is not None and (field.occupied is None or not config.skip_empty) and not field.gates:
         field = None  # all samples are present
     demand = _demand(mesh, tables, rays, config, field)
@@ -132,11 +141,12 @@ def fit_capacities(
         occupied_per_ray=None if field is None else _mean(np.asarray(demand.occupied) / len(total)),
     )
     config = dataclasses.replace(config, march=march, sampler=sampler)
-    if demand.visible is not None:
-        # Where features are integrated, samples have no colours to spare.
-        share = 0.0 if config.integrate == "features" else ONE_PASS
-        if int(demand.visible) > share * int(demand.occupied):
-            config = dataclasses.replace(config, min_weight=0.0)
+    one_pass = of_frames and config.integrate == "features"  # samples then have no colours to spare
+    if field is not None and config.min_weight > 0 and not one_pass:
+        few = jax.tree.map(lambda x: x[::VISIBLE_EVERY], rays)
+        one_pass = bool(_visible_share(field, tables, few, config) > ONE_PASS)
+    if one_pass:
+        config = dataclasses.replace(config, min_weight=0.0)
     return config
 
 

@@ -65,7 +65,8 @@ def frame_config(
     """`config` with a frame's steps and buffers that fit this camera's view; use it for a whole animation.
 
     Sizes are measured on pixels spread over those that hit the cage. What overflows nevertheless,
-    `render_frame` renders again.
+    `render_frame` renders again. Where most samples are visible, `min_weight` becomes 0
+    (`capacity.fit_capacities`). Raises ValueError as `sampling.with_step`.
     """
     config = refined(with_step(config, impostor.config.encoding))
     tables = _march_tables(impostor.mesh)
@@ -84,7 +85,8 @@ def frame_config(
 def refined(config: RenderConfig) -> RenderConfig:
     """A config that has a step with the steps of frames; once is enough."""
     factor, sampler = config.frame_refinement, config.sampler
-    assert sampler.step is not None
+    if sampler.step is None:
+        raise ValueError("SamplerConfig.step is not known without a field; see render.sampling.with_step")
     most = math.ceil(factor * sampler.max_samples_per_ray)
     mean = sampler.capacity_per_ray and math.ceil(factor * sampler.capacity_per_ray)
     sampler = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""Where each ray enters and leaves its tets: differentiable in vertices and rays (Eq. 3).
+"""Where each ray enters and leaves its tets: differentiable (in reverse mode) in vertices and rays (Eq. 3).
 
 Barycentric coordinates of the entry and exit points are those within the faces that the ray passes, never
 derived from the tet's volume, so that slivers cost no precision.
@@ -213,7 +213,7 @@ def _recomputed_ends(
 ) -> Ends:
     """What the march computed, as a differentiable function of vertices, origins and directions."""
     vertices, origins, directions = geometry
-    codes, count = jnp.maximum(codes, 0), jnp.int32(len(codes))
+    count, codes = jnp.sum(codes >= 0, dtype=jnp.int32), jnp.maximum(codes, 0)  # used slots come first
     tet_ids, local = codes // CODES_PER_TET, codes % CODES_PER_TET
     ts, lambdas = [], []
     for triangles in (ENTRY_TRIANGLES, EXIT_TRIANGLES):
