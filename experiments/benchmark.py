@@ -246,7 +246,6 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
     """A frame of the first test camera, and what it would cost without each skip, in turns.
 
     One pass gives every sample a colour, and two only those that a pass of densities finds visible.
-
     `psnr_to_exact` compares with the frame of every sample of every pixel: what the skips change.
     """
     camera = first_camera(scene, size)

@@ -5,7 +5,8 @@ import os
 import pytest
 
 from nimpostor_jax.config import ExperimentConfig
-from nimpostor_jax.pipeline.prepare import SMALL_LOOPS, fit_levels, use_all_cores
+from nimpostor_jax.gin_flags import load_config
+from nimpostor_jax.pipeline.prepare import SMALL_LOOPS, fit_levels, prepare, use_all_cores
 
 
 @pytest.mark.parametrize("pixels, levels", [(100.0, 13), (20.0, 10), (0.1, 1)])
@@ -24,3 +25,9 @@ def test_small_loops_are_compiled_as_a_whole_unless_the_user_has_such_options(ow
     monkeypatch.setenv("XLA_FLAGS", flags)
     use_all_cores()
     assert os.environ["XLA_FLAGS"] == (flags if own else f"{flags} {SMALL_LOOPS}")
+
+
+def test_a_step_that_is_not_known_is_asked_for_before_anything_is_read():
+    config = load_config(bindings=["SamplerConfig.measure='euclidean'"])
+    with pytest.raises(ValueError, match=r"SamplerConfig\.step must be given"):
+        prepare(config, "no/such/folder")

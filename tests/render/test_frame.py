@@ -280,3 +280,14 @@ def test_rays_that_miss_need_no_more_than_the_least():
     mesh = tet_mesh("cube")
     fitted = fit_capacities(mesh, march_tables(mesh), sample_rays(mesh, missing), RENDER)
     assert fitted.sampler.capacity_per_ray >= 1
+
+
+def test_a_process_may_render_in_float64_and_then_in_float32(scene):
+    """As `experiments/pareto.py` does for its reference; what is cached serves both."""
+    impostor, camera = scenes.impostor(), scenes.camera(20, 12)
+    with jax.enable_x64(True):
+        exact_camera = jax.tree.map(lambda x: x.astype("float64"), camera)
+        exact_frame = render_frame(scenes.impostor(dtype="float64"), exact_camera, RENDER)
+    frame = render_frame(impostor, camera, frame_config(impostor, camera, RENDER))
+    assert exact_frame.color.dtype == np.float64 and frame.color.dtype == np.float32
+    assert_allclose(frame.color, exact_frame.color, atol=1e-4)  # float32, and decoders with slopes of a few

@@ -75,6 +75,7 @@ def retrain(
     """
     if not region.tets.size:
         return new
+    render = with_step(render, new.config.encoding)  # complains now, and not after stage 1
     key, optimizer = jax.random.key(config.seed), make_optimizer()
     source = locate_tables(old.mesh)
     draw = jax.jit(partial(draw_points, measure=render.density_measure), static_argnames="count")
@@ -143,7 +144,7 @@ def _render_stage(
     pool, key, losses = pictures_of(old, new, region, render, config), jax.random.key(config.seed + 1), []
     probe = draw_batch(key, 0, pool, min(PROBE_RAYS, config.rays_per_batch), "random")
     march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.holds.shape[1])
-    sized = with_step(dataclasses.replace(render, march=march), new.config.encoding)
+    sized = dataclasses.replace(render, march=march)
     sized = fit_capacities(new.mesh, jax.jit(march_tables)(new.mesh), probe.rays, sized)
     gradient, place = loss_gradient, (lambda batch: batch)
     devices = jax.local_devices()

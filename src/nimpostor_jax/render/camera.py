@@ -39,7 +39,7 @@ def tile_order(height: int, width: int) -> Int[np.ndarray, " pixels"]:
     """
     y, x = np.mgrid[0:height, 0:width]
     keys = ((x % TILE).ravel(), (y % TILE).ravel(), (x // TILE).ravel(), (y // TILE).ravel())
-    order = np.lexsort(keys)
+    order = np.lexsort(keys).astype(np.int32)  # the same with and without x64
     order.flags.writeable = False  # kept for the next frame
     return order
 

@@ -17,7 +17,7 @@ from nimpostor_jax.render.baked import render_baked_rays
 from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, all_entries, fit_capacities, grow_march, ray_entries
 from nimpostor_jax.render.renderer import render_rays
-from nimpostor_jax.render.sampling import with_step
+from nimpostor_jax.render.sampling import known_step, with_step
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables
 from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor, Rays, RenderOutput, TetMesh
 
@@ -85,13 +85,11 @@ def frame_config(
 def refined(config: RenderConfig) -> RenderConfig:
     """A config that has a step with the steps of frames; once is enough."""
     factor, sampler = config.frame_refinement, config.sampler
-    if sampler.step is None:
-        raise ValueError("SamplerConfig.step is not known without a field; see render.sampling.with_step")
     most = math.ceil(factor * sampler.max_samples_per_ray)
     mean = sampler.capacity_per_ray and math.ceil(factor * sampler.capacity_per_ray)
     sampler = dataclasses.replace(
         sampler,
-        step=sampler.step / factor,
+        step=known_step(sampler) / factor,
         cone_angle=sampler.cone_angle / factor**2,  # growth a step: of smaller steps, and of more of them
         max_samples_per_ray=most,
         capacity_per_ray=mean,

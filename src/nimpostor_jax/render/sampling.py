@@ -85,14 +85,19 @@ def with_step(config: RenderConfig, field: EncodingConfig) -> RenderConfig:
     return dataclasses.replace(config, sampler=dataclasses.replace(sampler, step=step))
 
 
+def known_step(config: SamplerConfig) -> float:
+    """The config's step, in its measure. Raises ValueError where it has none (`with_step`)."""
+    if config.step is None:
+        raise ValueError("SamplerConfig.step is not known without a field; see render.sampling.with_step")
+    return config.step
+
+
 def step_boundaries(config: SamplerConfig) -> np.ndarray:
     """Distances from the first tet's entry at which steps end, [S + 1], before fitting to a ray (Eq. 4).
 
-    Raises ValueError for a config without a step (`with_step`).
+    Raises ValueError as `known_step`.
     """
-    if config.step is None:
-        raise ValueError("SamplerConfig.step is not known without a field; see render.sampling.with_step")
-    step, travelled = config.step, [0.0]
+    step, travelled = known_step(config), [0.0]
     for _ in range(config.max_samples_per_ray):
         travelled.append(travelled[-1] + step)
         step += config.cone_angle * travelled[-1]
