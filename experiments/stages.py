@@ -31,7 +31,7 @@ from nimpostor_jax.render.frame import CHUNK, frame_config
 from nimpostor_jax.render.renderer import integrate_samples, render_rays
 from nimpostor_jax.render.sampling import place_samples, plan_samples
 from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.selection import present_samples, visible_samples
+from nimpostor_jax.render.selection import present_samples, slabs_of, visible_samples
 from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.step import RayBatch, loss_gradient, make_optimizer, trainable
@@ -113,7 +113,12 @@ def render_stages(
     segments = stage(
         "segments", lambda m, r, c: locate_segments(m, r, c, 0.0, capacity), mesh, local, crossings
     )
-    plan = stage("plan", lambda s: plan_samples(s, config.sampler, config.density_measure, jitter), segments)
+    slabs = slabs_of(impostor, config) if jitter is None else None
+    plan = stage(
+        "plan",
+        lambda s, b: plan_samples(s, config.sampler, config.density_measure, jitter, slabs=b),
+        segments, slabs,
+    )  # fmt: skip
     plan, chosen, count = stage("cells", lambda i, p: present_samples(i, p, config), impostor, plan)
     numbers = {"planned": int(plan.num_used), "in occupied cells": int(count)}
     features = None
@@ -127,7 +132,11 @@ def render_stages(
         lambda i, r, s, f, o: integrate_samples(i, r, s, f, o, config),
         impostor, local, samples, features, segments.overflow,
     )  # fmt: skip
-    stage("all", lambda i, r, t, e: render_rays(i, r, config, jitter, t, e), impostor, rays, tables, entries)
+    stage(
+        "all",
+        lambda i, r, t, e, b: render_rays(i, r, config, jitter, t, e, slabs=b),
+        impostor, rays, tables, entries, slabs,
+    )  # fmt: skip
     print(f"{kind}: samples {numbers}")
     return [row | {"samples": numbers} for row in rows]
 

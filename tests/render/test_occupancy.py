@@ -12,6 +12,7 @@ from numpy.testing import assert_array_equal
 from rays import as_rays, generic
 from scenes import RENDER
 
+from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.occupancy import (
     cell_index,
     cell_resolution,
@@ -22,6 +23,9 @@ from nimpostor_jax.render.occupancy import (
     random_points,
 )
 from nimpostor_jax.render.renderer import render_rays, render_samples
+from nimpostor_jax.render.sampling import place_samples, plan_samples
+from nimpostor_jax.render.segments import march_segments
+from nimpostor_jax.render.selection import present_samples, slabs_of
 
 COUNT = 32
 render = jax.jit(render_rays, static_argnames="config")
@@ -94,6 +98,35 @@ def test_only_samples_in_occupied_cells_are_rendered():
     assert_array_equal(render(empty, rays, config).opacity, 0)
     kept = render(empty, rays, dataclasses.replace(config, skip_empty=False))
     np.testing.assert_allclose(kept.color, output.color, atol=1e-5)  # compiled as one, and step by step
+
+
+@pytest.mark.parametrize("measure", ["barycentric", "euclidean"])
+@pytest.mark.parametrize("cone", [0.0, 0.05])
+def test_slabs_leave_out_only_what_cells_would(measure, cone, rng):
+    """The same samples in the end, of fewer that were planned; tets are empty, full, or hold a few cells."""
+    impostor = scenes.impostor("blobs")
+    num_tets, step = len(impostor.mesh.tets), 0.02 if measure == "euclidean" else 0.05
+    share = rng.choice([0, 0.01, 0.1, 1], (num_tets, 1))
+    occupied = jnp.asarray(rng.uniform(size=(num_tets, num_cells(8))) < share)
+    impostor = dataclasses.replace(impostor, occupied=occupied)
+    sampler = dataclasses.replace(RENDER.sampler, measure=measure, step=step, cone_angle=cone)
+    sampler = dataclasses.replace(sampler, max_samples_per_ray=256)
+    config = dataclasses.replace(RENDER, sampler=sampler, min_weight=0.0)
+    rays, _ = view(impostor)
+    local = to_local(impostor.mesh, rays)
+    segments = march_segments(impostor.mesh, local, config)
+    slabs, kept, planned = slabs_of(impostor, config), [], []
+    for those in (None, slabs):
+        plan = plan_samples(segments, sampler, measure, slabs=those)
+        _, chosen, count = present_samples(impostor, plan, config)
+        samples = place_samples(plan, chosen, count)
+        kept.append([np.asarray(x)[: int(count)] for x in (samples.rays, samples.tet_ids, samples.t)])
+        planned.append(int(plan.num_used))
+    for expected, found in zip(*kept, strict=True):
+        assert_array_equal(found, expected)
+    assert len(kept[0][0]) <= planned[1] < planned[0]
+    assert len(kept[0][0]) > COUNT  # most rays see something
+    assert slabs_of(impostor, dataclasses.replace(config, skip_empty=False)) is None
 
 
 def test_with_jitter_some_rays_look_into_empty_cells():

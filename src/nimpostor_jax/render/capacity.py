@@ -18,7 +18,7 @@ from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.sampling import plan_samples, segment_measure, step_boundaries
 from nimpostor_jax.render.segments import in_cells, locate_segments, march_segments
-from nimpostor_jax.render.selection import present_samples, visible_samples
+from nimpostor_jax.render.selection import present_samples, slabs_of, visible_samples
 from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
 from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
 
@@ -56,7 +56,8 @@ class _Demand(NamedTuple):
     tets: Int[Array, " R"]  # that each ray crosses
     overflow: Bool[Array, ""]  # some did not fit
     total: Float[Array, " R"]  # each ray's measure
-    occupied: Int[Array, ""] | None  # samples in occupied cells
+    planned: Int[Array, ""] | None  # samples in slabs of occupied cells
+    occupied: Int[Array, ""] | None  # and in the cells themselves
 
 
 @partial(jax.jit, static_argnames="config")
@@ -68,15 +69,18 @@ def _demand(
     segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
     measure = segment_measure(segments, config.sampler.measure)
     total = jax.ops.segment_sum(measure, segments.rays, rays.origins.shape[0])
-    occupied = None
+    planned, occupied = None, None
     if field is not None:
         sampler = dataclasses.replace(config.sampler, capacity_per_ray=None, occupied_per_ray=None)
-        plan = plan_samples(in_cells(segments, field.embedding), sampler, config.density_measure)
+        in_field, slabs = in_cells(segments, field.embedding), slabs_of(field, config)
+        plan = plan_samples(in_field, sampler, config.density_measure, slabs=slabs)
+        planned = plan.num_used
         _, _, occupied = present_samples(field, plan, dataclasses.replace(config, sampler=sampler))
     return _Demand(
         tets=jnp.sum(crossings.codes >= 0, axis=0),
         overflow=jnp.any(crossings.overflow),
         total=total,
+        planned=planned,
         occupied=occupied,
     )
 
@@ -87,7 +91,8 @@ def _visible_share(
 ) -> Float[Array, ""]:
     """Of the samples that may be seen, the share that contributes `min_weight`; in buffers that fit."""
     segments = march_segments(field.mesh, to_local(field.mesh, rays), config, tables)
-    plan = plan_samples(in_cells(segments, field.embedding), config.sampler, config.density_measure)
+    in_field, slabs = in_cells(segments, field.embedding), slabs_of(field, config)
+    plan = plan_samples(in_field, config.sampler, config.density_measure, slabs=slabs)
     plan, chosen, present = present_samples(field, plan, config)
     _, _, visible = visible_samples(field, plan, chosen, present, config, None)
     return visible / jnp.maximum(present, 1)
@@ -130,15 +135,18 @@ def fit_capacities(
     wanted = np.clip(np.searchsorted(boundaries, total * (1 - 1e-5)), 0, len(boundaries) - 1)
     most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
     tets = np.asarray(demand.tets)
+    planned = wanted.sum() if demand.planned is None else demand.planned
     most_tets = _round_up(margin * int(tets.max()))
     march = dataclasses.replace(
-        config.march, max_tets_per_ray=most_tets, capacity_per_ray=min(most_tets, _mean(tets))
+        config.march,
+        max_tets_per_ray=most_tets,
+        capacity_per_ray=min(most_tets, _mean(tets.sum(), len(tets))),
     )
     sampler = dataclasses.replace(
         config.sampler,
         max_samples_per_ray=most,
-        capacity_per_ray=min(most, _mean(wanted)),
-        occupied_per_ray=None if field is None else _mean(np.asarray(demand.occupied) / len(total)),
+        capacity_per_ray=min(most, _mean(planned, len(total))),
+        occupied_per_ray=None if field is None else _mean(demand.occupied, len(total)),
     )
     config = dataclasses.replace(config, march=march, sampler=sampler)
     one_pass = of_frames and config.integrate == "features"  # samples then have no colours to spare
@@ -161,9 +169,9 @@ def grow_march(config: RenderConfig) -> RenderConfig:
     return dataclasses.replace(config, march=march)
 
 
-def _mean(needed: np.ndarray) -> int:
+def _mean(needed: int | Array, num_rays: int) -> int:
     """Room for a mean ray, with the margin of buffers that many rays share."""
-    return max(1, int(np.ceil(SHARED_MARGIN * needed.mean())))
+    return max(1, int(np.ceil(SHARED_MARGIN * int(needed) / num_rays)))
 
 
 def _round_up(value: float) -> int:

@@ -16,8 +16,10 @@ from nimpostor_jax.field.impostor import merge_levels
 from nimpostor_jax.render.baked import render_baked_rays
 from nimpostor_jax.render.camera import TILE, image_pixels, pixel_rays, tile_order
 from nimpostor_jax.render.capacity import MAX_GROWTH, all_entries, fit_capacities, grow_march, ray_entries
+from nimpostor_jax.render.occupancy import Slabs
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.sampling import known_step, with_step
+from nimpostor_jax.render.selection import slabs_of
 from nimpostor_jax.render.traverse import Entries, MarchTables, march_tables
 from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor, Rays, RenderOutput, TetMesh
 
@@ -37,6 +39,7 @@ class Frame(NamedTuple):
 
 
 _march_tables = jax.jit(march_tables)
+_slabs_of = jax.jit(slabs_of, static_argnames="config")
 
 
 @partial(jax.jit, static_argnames=("height", "width"))
@@ -165,7 +168,8 @@ class View:
         self._rays = jax.tree.map(np.asarray, _tiled_rays(camera, camera.height, camera.width))
         mesh = device_mesh()
         self._num_devices = mesh.size
-        self._replicas = jax.device_put((impostor, self._tables), NamedSharding(mesh, P()))
+        slabs = None if isinstance(impostor, BakedImpostor) else _slabs_of(impostor, config)
+        self._replicas = jax.device_put((impostor, self._tables, slabs), NamedSharding(mesh, P()))
         self._by_ray = NamedSharding(mesh, P("rays"))
         self._entries = self._all_entries()
         self.hits = np.flatnonzero(self._entries.holds[:, 0] >= 0)
@@ -175,7 +179,7 @@ class View:
         count = self._rays.origins.shape[0]
         padding = (0, -count % (TILE * TILE * self._num_devices))
         rays = jax.tree.map(lambda x: np.pad(x, (padding, (0, 0)), mode="edge"), self._rays)
-        impostor, tables = self._replicas
+        impostor, tables, _ = self._replicas
         placed = jax.device_put(rays, self._by_ray)
         entries = _entries_sharded(impostor.mesh, tables, placed, self._config.march)
         return jax.tree.map(lambda x: np.asarray(x)[:count], entries)
@@ -259,26 +263,30 @@ def _entries_sharded(mesh: TetMesh, tables: MarchTables, rays: Rays, config: Mar
 def _render_sharded(
     impostor: NeuralImpostor | BakedImpostor,
     tables: MarchTables,
+    slabs: Slabs | None,
     rays: Rays,
     entries: Entries,
     refinement: Float[jax.Array, " R"],
     config: RenderConfig,
 ) -> RenderOutput:
-    specs = (P(), P(), P("rays"), P("rays"), P("rays"))
+    specs = (P(), P(), P(), P("rays"), P("rays"), P("rays"))
 
     @partial(jax.shard_map, mesh=device_mesh(), in_specs=specs, out_specs=P("rays"), check_vma=False)
     def shard(
         impostor: NeuralImpostor | BakedImpostor,
         tables: MarchTables,
+        slabs: Slabs | None,
         rays: Rays,
         entries: Entries,
         refinement: Float[jax.Array, " R"],
     ) -> RenderOutput:
         if isinstance(impostor, BakedImpostor):
             return render_baked_rays(impostor, rays, config, tables, entries)
-        return render_rays(impostor, rays, config, tables=tables, entries=entries, refinement=refinement)
+        return render_rays(
+            impostor, rays, config, tables=tables, entries=entries, refinement=refinement, slabs=slabs
+        )
 
-    return shard(impostor, tables, rays, entries, refinement)
+    return shard(impostor, tables, slabs, rays, entries, refinement)
 
 
 def _spread(rays: np.ndarray, chunk: int) -> list[np.ndarray]:

@@ -6,10 +6,15 @@ with the tet. Training records when a cell last contributed to a pixel, and look
 Axes: T tets, C = N (N + 1) (N + 2) / 6 cells of a tet, M samples.
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+SLAB_MARGIN = 1e-4  # above the rounding of coordinates, far below the width of a cell
 
 
 def num_cells(resolution: int) -> int:
@@ -66,6 +71,28 @@ def in_occupied_cells(
     """Whether each point lies in an occupied cell."""
     index = cell_index(tet_ids, lambdas, occupied.shape[1])
     return occupied.reshape(-1).at[index].get(mode="promise_in_bounds")
+
+
+class Slabs(NamedTuple):
+    """Between which barycentric coordinates the occupied cells of each tet lie; an empty tet has none."""
+
+    low: Float[Array, "T 4"]
+    high: Float[Array, "T 4"]
+
+
+def occupied_slabs(occupied: Bool[Array, "T C"]) -> Slabs:
+    """Slabs around occupied cells: a quick test for whole segments, before their samples are looked at."""
+    resolution = cell_resolution(occupied.shape[1])
+    corners = _corners(resolution)
+    left = resolution - corners.sum(axis=1, keepdims=True)
+    low = np.concatenate([corners, np.maximum(left - 3, 0)], axis=1) / resolution - SLAB_MARGIN
+    high = np.concatenate([corners + 1, left], axis=1) / resolution + SLAB_MARGIN
+
+    def reduce(fold: Callable, ends: np.ndarray, none: float) -> Float[Array, "T 4"]:
+        columns = [fold(jnp.where(occupied, jnp.float32(end), none), axis=1) for end in ends.T]
+        return jnp.stack(columns, axis=1)
+
+    return Slabs(reduce(jnp.min, low, jnp.inf), reduce(jnp.max, high, -jnp.inf))
 
 
 def finer_cells(occupied: Bool[Array, "T C"], parts: int) -> Bool[Array, "T parts"]:

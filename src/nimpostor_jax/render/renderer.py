@@ -13,6 +13,7 @@ from nimpostor_jax.field.decoder import Parameters, decode_appearance, num_decod
 from nimpostor_jax.field.solids import painted
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sum_by_ray
+from nimpostor_jax.render.occupancy import Slabs
 from nimpostor_jax.render.sampling import Samples, place_samples, plan_samples, with_step
 from nimpostor_jax.render.segments import in_cells, march_segments
 from nimpostor_jax.render.selection import (
@@ -33,6 +34,7 @@ def render_rays(
     tables: MarchTables | None = None,
     entries: Entries | None = None,
     refinement: Float[Array, " R"] | None = None,
+    slabs: Slabs | None = None,
 ) -> RenderOutput:
     """Colour, opacity and depth of rays [R] given in world space. Pure; jit it with `config` static.
 
@@ -40,10 +42,12 @@ def render_rays(
     in [0, 1) samples move within their steps (training); without, they sit in the middle. Pass `tables` to
     spare rearranging the mesh in every call; by default they are made from the mesh's current vertices. Pass
     the rays' `entries` (`traverse.find_entries`) where the same rays see the same mesh again.
-    `refinement` divides the steps of each ray, and `min_weight`. Where tets overlap, after a deformation or
-    because there are several objects, their samples are merged: one transmittance for all (Eq. 16).
+    `refinement` divides the steps of each ray, and `min_weight`. With the impostor's `slabs`
+    (`selection.slabs_of`) empty stretches of rays cost less; found once, they serve all rays. Where tets
+    overlap, after a deformation or because there are several objects, their samples are merged: one
+    transmittance for all (Eq. 16).
     """
-    return render_samples(impostor, rays, config, jitter, tables, entries, refinement)[0]
+    return render_samples(impostor, rays, config, jitter, tables, entries, refinement, slabs)[0]
 
 
 def render_samples(
@@ -54,13 +58,14 @@ def render_samples(
     tables: MarchTables | None = None,
     entries: Entries | None = None,
     refinement: Float[Array, " R"] | None = None,
+    slabs: Slabs | None = None,
 ) -> tuple[RenderOutput, Samples]:
     """`render_rays`, and the samples of which the colours are made."""
     config = with_step(config, impostor.config.encoding)
     local = to_local(impostor.mesh, rays)
     segments = march_segments(impostor.mesh, local, config, tables, entries)
     segments = in_cells(segments, impostor.embedding)
-    plan = plan_samples(segments, config.sampler, config.density_measure, jitter, refinement)
+    plan = plan_samples(segments, config.sampler, config.density_measure, jitter, refinement, slabs)
     plan, chosen, num_used = present_samples(impostor, plan, config)
     features = None
     if config.min_weight > 0:

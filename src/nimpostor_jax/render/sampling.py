@@ -8,6 +8,7 @@ Axes: N packed segments, R rays, S samples a ray at most, M packed samples.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 from nimpostor_jax.chunks import default_chunk, map_used, running
 from nimpostor_jax.config import EncodingConfig, Measure, RenderConfig, SamplerConfig
 from nimpostor_jax.render.composite import sum_before
+from nimpostor_jax.render.occupancy import Slabs
 from nimpostor_jax.types import TetSegments
 
 GOLDEN_RATIO = 0.6180339887498949
@@ -50,7 +52,7 @@ class SamplePlan:
     density: Float[Array, " N"]  # of the density measure in one unit of the step measure
     boundaries: Float[Array, " S+1"]
     scale: Float[Array, " R"]  # of the ray's steps
-    firsts: Int[Array, " R"]  # number of the ray's first sample
+    offsets: Int[Array, " N"]  # from steps on the ray to numbers of samples, in each segment
     jitter: Float[Array, " R"] | None
     owners: Int[Array, " M"]  # the segment of each sample
     num_used: Int[Array, ""]
@@ -110,13 +112,14 @@ def plan_samples(
     density_measure: Measure,
     jitter: Float[Array, " R"] | None = None,
     refinement: Float[Array, " R"] | None = None,
+    slabs: Slabs | None = None,
 ) -> SamplePlan:
     """Count each ray's samples: at the middle of each step, or stratified within it where `jitter` is given.
 
     `jitter` in [0, 1) is one number a ray; its samples' places follow by golden-ratio steps, so that they
     depend neither on the batch around the ray nor on the number of devices. Steps are scaled down so that a
     whole number of them fills the ray exactly. Empty rays get no samples. `refinement` divides a ray's steps
-    (with cone growth, later ones by less).
+    (with cone growth, later ones by less). Samples outside the `slabs` of their tets are left out.
     """
     num_rays, owners = segments.overflow.shape[0], segments.rays
     max_samples = config.max_samples_per_ray
@@ -129,20 +132,26 @@ def plan_samples(
     # The tolerance keeps a ray of exactly n steps from getting n + 1 by rounding.
     asked = jax.lax.stop_gradient(total if refinement is None else total * refinement)
     fits = jnp.searchsorted(boundaries, asked * (1 - 1e-5)).astype(jnp.int32)
-    wanted = jnp.where(total > 0, jnp.clip(fits, 1, max_samples), 0)
-    counts = jnp.clip(capacity - (jnp.cumsum(wanted) - wanted), 0, wanted)
-    firsts = jnp.cumsum(counts) - counts
-    scale = total / boundaries[jnp.maximum(wanted, 1)]
+    counts = jnp.where(total > 0, jnp.clip(fits, 1, max_samples), 0)
+    scale = total / boundaries[jnp.maximum(counts, 1)]
     if density_measure == config.measure:
         density = jnp.ones_like(extents)
     else:
         density = segment_measure(segments, density_measure) / jnp.where(extents > 0, extents, 1)
 
-    # Each segment with samples marks its first; the marks ascend, so that a running maximum spreads them.
-    before = _samples_before(config, segments, starts, total, boundaries, scale, counts, jitter)
+    grid = _Steps(boundaries, scale, counts, total, jitter)
+    before = grid.before(config, owners, starts)
     same_ray = jnp.pad(owners[1:] == owners[:-1], (0, min(1, owners.size)))
     until = jnp.where(same_ray, jnp.roll(before, -1), counts[owners])
-    places = jnp.where((extents > 0) & (until > before), firsts[owners] + before, capacity)
+    if slabs is not None:
+        enter, leave = _shares_inside(segments, slabs)
+        until = jnp.minimum(until, grid.before(config, owners, starts + leave * extents))
+        before = jnp.maximum(before, grid.before(config, owners, starts + enter * extents))
+    wanted = jnp.where(extents > 0, jnp.maximum(until - before, 0), 0)
+    firsts = running(jnp.add, wanted, 0) - wanted
+    lost = firsts + wanted > capacity
+    # Each segment with samples marks its first; the marks ascend, so that a running maximum spreads them.
+    places = jnp.where(wanted > 0, firsts, capacity)
     order = jnp.arange(owners.size, dtype=jnp.int32)
     marks = jnp.zeros(capacity, jnp.int32).at[places].set(order, mode="drop")
     return SamplePlan(
@@ -152,13 +161,26 @@ def plan_samples(
         density=density,
         boundaries=boundaries,
         scale=scale,
-        firsts=firsts,
+        offsets=firsts - before,
         jitter=jitter,
         owners=running(jnp.maximum, marks, 0),
-        num_used=jnp.sum(counts),
-        overflow=counts < wanted,
+        num_used=jnp.minimum(jnp.sum(wanted), capacity),
+        overflow=jnp.zeros(num_rays, bool).at[owners].max(lost & (wanted > 0)),
         coarsened=fits > max_samples,
     )
+
+
+def _shares_inside(segments: TetSegments, slabs: Slabs) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
+    """The share of each segment before it enters its tet's slabs, and until it leaves them."""
+    first, last, tets = jax.lax.stop_gradient(
+        (segments.lambda_enter, segments.lambda_exit, jnp.maximum(segments.tet_ids, 0))
+    )
+    change = last - first
+    change = jnp.where(change == 0, jnp.finfo(change.dtype).tiny, change)  # inside or outside all along
+    to_low, to_high = (slabs.low[tets] - first) / change, (slabs.high[tets] - first) / change
+    enter = jnp.max(jnp.where(change > 0, to_low, to_high), axis=1)
+    leave = jnp.min(jnp.where(change > 0, to_high, to_low), axis=1)
+    return jnp.clip(enter, 0, 1), jnp.clip(leave, 0, 1)
 
 
 def place_samples(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]) -> Samples:
@@ -187,7 +209,7 @@ def place(plan: SamplePlan, items: tuple[Int[Array, " M"], Int[Array, " M"]]) ->
     numbers, owners = items
     segments = plan.segments
     rays = segments.rays[owners]
-    steps = jnp.clip(numbers - plan.firsts[rays], 0, plan.boundaries.size - 2)
+    steps = jnp.clip(numbers - plan.offsets[owners], 0, plan.boundaries.size - 2)
     low, high, scale = plan.boundaries[steps], plan.boundaries[steps + 1], plan.scale[rays]
     position = (low + _share(steps, plan.jitter, rays) * (high - low)) * scale
     extent = plan.extents[owners]
@@ -211,26 +233,28 @@ def _share(
     return 0.5 if jitter is None else (jitter[rays] + GOLDEN_RATIO * steps) % 1
 
 
-def _samples_before(
-    config: SamplerConfig,
-    segments: TetSegments,
-    starts: Float[Array, " N"],
-    total: Float[Array, " R"],
-    boundaries: Float[Array, " S+1"],
-    scale: Float[Array, " R"],
-    counts: Int[Array, " R"],
-    jitter: Float[Array, " R"] | None,
-) -> Int[Array, " N"]:
-    """How many of its ray's samples lie before the start of each segment."""
-    rays = segments.rays
-    position = starts / jnp.where(scale > 0, scale, 1)[rays]
-    if config.cone_angle == 0:
-        step = (position / boundaries[1]).astype(jnp.int32)
-    else:
-        step = jnp.searchsorted(boundaries, position, side="right").astype(jnp.int32) - 1
-    step = jnp.clip(step, 0, boundaries.size - 2)
-    low, high = boundaries[step], boundaries[step + 1]
-    before = step + (low + _share(step, jitter, rays) * (high - low) < position)
-    # Rounding leaves no sample behind the last segment.
-    done = starts >= total[rays] * (1 - 2 * jnp.finfo(starts.dtype).eps)
-    return jnp.where(done, counts[rays], jnp.minimum(before, counts[rays]))
+class _Steps(NamedTuple):
+    """The steps of all rays."""
+
+    boundaries: Float[Array, " S+1"]
+    scale: Float[Array, " R"]
+    counts: Int[Array, " R"]
+    total: Float[Array, " R"]
+    jitter: Float[Array, " R"] | None
+
+    def before(
+        self, config: SamplerConfig, rays: Int[Array, " N"], measure: Float[Array, " N"]
+    ) -> Int[Array, " N"]:
+        """How many of a ray's samples lie before places on it."""
+        boundaries, scale, counts = self.boundaries, self.scale[rays], self.counts[rays]
+        position = measure / jnp.where(scale > 0, scale, 1)
+        if config.cone_angle == 0:
+            step = (position / boundaries[1]).astype(jnp.int32)
+        else:
+            step = jnp.searchsorted(boundaries, position, side="right").astype(jnp.int32) - 1
+        step = jnp.clip(step, 0, boundaries.size - 2)
+        low, high = boundaries[step], boundaries[step + 1]
+        found = step + (low + _share(step, self.jitter, rays) * (high - low) < position)
+        # Rounding leaves no sample behind the last segment.
+        done = measure >= self.total[rays] * (1 - 2 * jnp.finfo(measure.dtype).eps)
+        return jnp.where(done, counts, jnp.minimum(found, counts))

@@ -15,7 +15,7 @@ from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import CLOSED, MIXED, OPEN, is_kept
 from nimpostor_jax.render.composite import sample_weights
-from nimpostor_jax.render.occupancy import in_occupied_cells
+from nimpostor_jax.render.occupancy import Slabs, in_occupied_cells, occupied_slabs
 from nimpostor_jax.render.sampling import SamplePlan, Samples, place, place_samples
 from nimpostor_jax.types import NeuralImpostor
 
@@ -38,7 +38,7 @@ def _limited(
     plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""], per_ray: int | None
 ) -> tuple[SamplePlan, Int[Array, " M"], Int[Array, ""]]:
     """As many of the first samples as `per_ray` makes room for."""
-    num_rays = plan.firsts.shape[0]
+    num_rays = plan.scale.shape[0]
     wanted = num_rays * (per_ray or 0)
     room = padded_size(wanted, default_chunk(wanted))  # whole chunks, as in the plan
     if per_ray is None or room >= chosen.size:
@@ -47,6 +47,13 @@ def _limited(
     lost = (num_used > room) & (jnp.arange(num_rays) >= first_lost)
     plan = dataclasses.replace(plan, overflow=plan.overflow | lost)
     return plan, chosen[:room], jnp.minimum(num_used, room)
+
+
+def slabs_of(impostor: NeuralImpostor, config: RenderConfig) -> Slabs | None:
+    """Slabs around what may be seen of each tet, for `plan_samples`; None where nothing is left out."""
+    if not config.skip_empty or impostor.occupied is None:
+        return None
+    return occupied_slabs(impostor.occupied)
 
 
 def occupied_samples(impostor: NeuralImpostor, plan: SamplePlan, config: RenderConfig) -> Chosen:
