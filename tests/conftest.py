@@ -26,7 +26,7 @@ jax.config.update(
 )  # for the tests of data parallelism and of frames on several devices
 
 
-CORE = {"geometry", "encoding", "field", "render", "train", "edit"}
+CORE = {"geometry", "encoding", "field", "render", "train", "edit", "pipeline"}
 
 
 @pytest.fixture(autouse=True)

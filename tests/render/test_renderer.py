@@ -284,10 +284,13 @@ def test_invisible_samples_may_be_left_out():
 
 @pytest.mark.parametrize("min_weight", [0.0, 1e-4])
 def test_no_rays_give_no_colours(min_weight):
-    nothing = as_rays((np.zeros((0, 3)), np.zeros((0, 3))))
-    output = render(scenes.impostor(), nothing, dataclasses.replace(RENDER, min_weight=min_weight))
+    nothing, impostor = as_rays((np.zeros((0, 3)), np.zeros((0, 3)))), scenes.impostor()
+    config = dataclasses.replace(RENDER, min_weight=min_weight)
+    output = render(impostor, nothing, config)
     assert output.color.shape == (0, 3)
     assert output.overflow.shape == (0,)
+    moved = jax.grad(lambda i: jnp.sum(render(i, nothing, config).color), allow_int=True)(impostor)
+    assert not np.any(moved.mesh.vertices) and not np.any(moved.tables.features)
 
 
 def test_overflow_and_coarsening_reach_the_output():

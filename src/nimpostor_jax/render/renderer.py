@@ -20,6 +20,7 @@ from nimpostor_jax.render.selection import (
     optical_weights,
     present_samples,
     sample_densities,
+    slabs_of,
     visible_samples,
 )
 from nimpostor_jax.render.traverse import Entries, MarchTables
@@ -42,10 +43,10 @@ def render_rays(
     in [0, 1) samples move within their steps (training); without, they sit in the middle. Pass `tables` to
     spare rearranging the mesh in every call; by default they are made from the mesh's current vertices. Pass
     the rays' `entries` (`traverse.find_entries`) where the same rays see the same mesh again.
-    `refinement` divides the steps of each ray, and `min_weight`. With the impostor's `slabs`
-    (`selection.slabs_of`) empty stretches of rays cost less; found once, they serve all rays. Where tets
-    overlap, after a deformation or because there are several objects, their samples are merged: one
-    transmittance for all (Eq. 16).
+    `refinement` divides the steps of each ray, and `min_weight`. Without jitter rays keep to the impostor's
+    `slabs` (`selection.slabs_of`), found here where they are not given. Where tets overlap, after a
+    deformation or because there are several objects, their samples are merged: one transmittance for all
+    (Eq. 16).
     """
     return render_samples(impostor, rays, config, jitter, tables, entries, refinement, slabs)[0]
 
@@ -65,6 +66,8 @@ def render_samples(
     local = to_local(impostor.mesh, rays)
     segments = march_segments(impostor.mesh, local, config, tables, entries)
     segments = in_cells(segments, impostor.embedding)
+    if slabs is None and jitter is None:
+        slabs = slabs_of(impostor, config)
     plan = plan_samples(segments, config.sampler, config.density_measure, jitter, refinement, slabs)
     plan, chosen, num_used = present_samples(impostor, plan, config)
     features = None
