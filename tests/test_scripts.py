@@ -36,7 +36,8 @@ def run(script, *arguments, timeout=300):
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, env=quick)
 
 
-def test_train_evaluate_and_render(tmp_path):
+def test_train_and_render(tmp_path):
+    """(`.ci/run` evaluates the same run again.)"""
     done = run("train.py", "--data=fluffy_ball", f"--workdir={tmp_path}", *SMALL)
     assert done.returncode == 0, done.stderr
     for name in ("cage.npz", "config.gin", "log.csv", "impostor.npz", "metrics.json"):
@@ -44,12 +45,6 @@ def test_train_evaluate_and_render(tmp_path):
     trained = json.loads((tmp_path / "metrics.json").read_text())
     assert trained["steps"] == 20
     assert len(trained["per_view"]) == 25
-
-    done = run("evaluate.py", "--data=fluffy_ball", f"--workdir={tmp_path}")
-    assert done.returncode == 0, done.stderr
-    again = json.loads((tmp_path / "metrics.json").read_text())
-    # Another run of the same compiled arithmetic on the same devices: only chunk sizes may differ.
-    assert again["psnr"] == pytest.approx(trained["psnr"], abs=0.01)
 
     bend = tmp_path / "twist.json"
     bend.write_text('{"name": "twist", "k": 0.9}')
