@@ -353,11 +353,11 @@ class RetrainConfig:
     old field shows outside of the new cage.
     """
 
-    feature_steps: int = 200
+    feature_steps: int = 100
     points_per_batch: int = 1 << 16
-    render_steps: int = 400
+    render_steps: int = 250
     rays_per_batch: int = 4096
-    views: int = 32  # pictures of the old impostor, from all around the region, that stage 2 trains on
+    views: int = 24  # pictures of the old impostor, from all around the region, that stage 2 trains on
     view_width: int = 200
     feature_rate: float = 1e-2  # of both stages' tables; falls to a tenth in the second
     decoder_rate: float = 2e-3

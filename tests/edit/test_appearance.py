@@ -88,7 +88,7 @@ def test_paints_follow_the_cage_and_survive_everything_else(tmp_path):
 
 
 def test_paints_and_gates_are_the_same_in_one_pass_and_in_two(rng):
-    """On a cage finer than the field's and with cells left out: the first pass takes only what is not seen."""
+    """On a cage finer than the field's, with cells left out: the first pass drops only what is not seen."""
     made = recolored(scenes.impostor("cube"), FunctionSolid(lower), RED)
     cells = jnp.asarray(rng.uniform(size=(len(made.mesh.tets), num_cells(4))) < 0.5)
     made = gated(dataclasses.replace(made, occupied=cells), FunctionSolid(beside), keep_inside=True)

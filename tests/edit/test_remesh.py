@@ -1,6 +1,7 @@
 """edit.remesh and what it is made of: what fits is kept, the rest is trained, nothing else changes."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,10 @@ from nimpostor_jax.edit.deform import deform, rigid, stretch
 from nimpostor_jax.edit.probe import draw_points, occupancy_of
 from nimpostor_jax.edit.region import Region, trained_part, with_region, with_trained_part
 from nimpostor_jax.edit.remesh import consolidate, overlay, transfer
+from nimpostor_jax.edit.retrain import fit_features
 from nimpostor_jax.edit.subdivide import subdivide
+from nimpostor_jax.field import impostor as field
+from nimpostor_jax.field.solids import to_cells
 from nimpostor_jax.geometry.locate import locate_tables
 from nimpostor_jax.geometry.topology import world_vertices
 from nimpostor_jax.render.camera import image_pixels, pixel_rays
@@ -81,6 +85,29 @@ def test_a_local_change_leaves_all_other_tets_their_bits():
     assert not np.allclose(new.decoders["density"][0]["weight"][1], made.decoders["density"][0]["weight"][0])
     index = np.asarray(new.decoder_index)[cells]
     assert_array_equal(index, trained.astype(int))
+
+
+def test_tables_start_near_the_old_features():
+    """The same tets as new ones: levels without collisions can be met, and the other tets keep their bits."""
+    made = scenes.impostor("delaunay")
+    cells = np.arange(len(made.mesh.tets))
+    changed = np.where(cells % 2, -1, cells)
+    places = np.broadcast_to(np.eye(4), (len(cells), 4, 4))
+    new, region = with_region(made, made.mesh, changed, places, cells)
+    source, start, off = locate_tables(made.mesh), new, []
+    draw = jax.jit(functools.partial(draw_points, count=1 << 13, measure="barycentric"))
+    for i in range(12):
+        points = draw(jax.random.key(i), made, source, new, region)
+        found = field.features(new, *to_cells(new.embedding, points.tets, points.lambdas))
+        off.append(np.mean(np.square(found - points.features), axis=0))
+        new = fit_features(new, region, points)
+    levels = made.config.encoding.num_levels
+    dense = np.asarray(new.tables.layout.rank_starts).size - 1
+    first, last = (x.reshape(levels, -1).mean(axis=1) for x in (off[0], off[-1]))
+    assert dense >= 1 and np.all(last[:dense] < 0.02 * first[:dense]), (first, last)
+    assert np.all(last < 0.9 * first), (first, last)  # hashed otherwise than before
+    same = np.delete(np.asarray(new.tables.features), region.entries, axis=0)
+    assert_array_equal(same, np.delete(np.asarray(start.tables.features), region.entries, axis=0))
 
 
 @pytest.mark.slow

@@ -47,7 +47,8 @@ from nimpostor_jax.train.step import (
 from nimpostor_jax.types import NeuralImpostor
 
 FEATURE_WEIGHT = 0.1  # of features, where opacities and colours count 1
-START_BATCHES = 16  # of points, for the first guess of tables
+START_UPDATES = 8  # of tables, before stage 1
+START_BATCHES = 4  # of points, together in an update
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
 SYNC_EVERY = 8  # steps that may be under way at once
@@ -80,17 +81,10 @@ def retrain(
     source = locate_tables(old.mesh)
     draw = jax.jit(partial(draw_points, measure=render.density_measure), static_argnames="count")
     new = dataclasses.replace(new, occupied=occupancy_of(old, source, new, region, config))
-    guess = (jnp.zeros_like(new.tables.features),) * 2
-    for i in range(START_BATCHES):
-        points = draw(jax.random.fold_in(key, i), old, source, new, region, count=config.points_per_batch)
-        guess = _add_points(guess, new, points)
-    sums, weights = guess
-    mean = sums / jnp.where(weights > 0, weights, 1)
-    tables = dataclasses.replace(
-        new.tables, features=new.tables.features.at[region.entries].set(mean[region.entries])
-    )
-    new = dataclasses.replace(new, tables=tables)
-
+    for i in range(START_UPDATES):
+        several = START_BATCHES * config.points_per_batch
+        points = draw(jax.random.fold_in(key, i), old, source, new, region, count=several)
+        new = fit_features(new, region, points)
     state = RetrainState(part=(part := trained_part(new, region)), optimizer=optimizer.init(part))
     rates = {"features": config.feature_rate, "decoders": config.decoder_rate}
     state, losses = _feature_stage(old, source, new, region, draw, config, state, optimizer, rates)
@@ -120,7 +114,7 @@ def _feature_stage(
     step = partial(feature_step, draw=draw, optimizer=optimizer, gradient=on_all_devices(mesh))
     compiled = jax.jit(step, donate_argnums=0)
     for i in tqdm(range(config.feature_steps), desc="features", unit="step", disable=None):
-        keys = jax.random.split(jax.random.fold_in(key, START_BATCHES + i), len(devices))
+        keys = jax.random.split(jax.random.fold_in(key, START_UPDATES + i), len(devices))
         state, loss = compiled(state, *fields, jax.device_put(keys, over_rays(mesh)), rates)
         losses.append(loss)
         if i % SYNC_EVERY == 0:
@@ -167,17 +161,25 @@ def _render_stage(
 
 
 @jax.jit
-def _add_points(guess: tuple[Array, Array], new: NeuralImpostor, points: Points) -> tuple[Array, Array]:
-    """Add up, by table entry, features times their weights, and weights: their ratio is a smoothed field."""
+def fit_features(new: NeuralImpostor, region: Region, points: Points) -> NeuralImpostor:
+    """The region's tables after one update of simultaneous iterative reconstruction towards the old features.
+
+    Each entry moves by the mean, weighted as it is interpolated, of what is missing at the points around it.
+    Some updates come as near to the least squares of Eq. 12's stage 1 as its hashed levels allow.
+    """
     cells, places = to_cells(new.embedding, points.tets, points.lambdas)
 
     def encoded(features: Array) -> Array:
         tables = dataclasses.replace(new.tables, features=features)
         return encode(tables, new.config.encoding, cells, places)
 
-    _, pull = jax.vjp(encoded, new.tables.features)
-    weight = jnp.broadcast_to(points.present[:, None], points.features.shape).astype(points.features.dtype)
-    return guess[0] + pull(points.features * weight)[0], guess[1] + pull(weight)[0]
+    features = new.tables.features
+    found, pull = jax.vjp(encoded, features)
+    weight = jnp.broadcast_to(points.present[:, None], found.shape).astype(found.dtype)
+    missing, weights = pull((points.features - found) * weight)[0], pull(weight)[0]
+    moved = features + missing / jnp.where(weights > 0, weights, 1)
+    moved = features.at[region.entries].set(moved[region.entries])
+    return dataclasses.replace(new, tables=dataclasses.replace(new.tables, features=moved))
 
 
 def feature_loss(
