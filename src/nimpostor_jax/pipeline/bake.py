@@ -91,7 +91,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
 
     def tables(*moments: Moments) -> HashTables:
         texels = np.concatenate([solve_moments(part, faces) for part in moments], axis=2)
-        return HashTables(features=jnp.asarray(texels.reshape(len(faces), -1), jnp.float32), layout=layout)
+        return HashTables(features=jnp.asarray(texels.reshape(len(faces), -1)), layout=layout)
 
     moments = no_moments(len(faces), 1)
     for batch in batches(DEPTHS_SHARE, "depths"):
@@ -111,6 +111,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
         decoder_index=decoder_index,
         config=impostor.config,
     )
+    del contents, moments  # as large as the textures
     return refine(baked, pool, train, render, config, log=log)
 
 

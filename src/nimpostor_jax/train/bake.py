@@ -28,6 +28,7 @@ from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, NeuralImp
 
 RIDGE = 1e-3  # of a texel's evidence, against dependence on the direction
 FACE_EVIDENCE = 0.05  # rays that a face's mean counts for in each of its texels
+SOLVED = 1 << 16  # texels at a time
 
 
 @struct.dataclass
@@ -154,22 +155,28 @@ def _add(
 def solve_moments(
     moments: Moments, face_of_texel: Int[np.ndarray, " texels"]
 ) -> Float[np.ndarray, "texels 4 channels"]:
-    """Each texel's coefficients. Host code, float64.
+    """Each texel's coefficients. Host code, float64 in blocks of texels, since all need gigabytes.
 
     A texel that few rays have seen takes after the mean of its face, and all dependence on the direction is
     held back a little.
     """
-    products, sums = (np.asarray(x, np.float64) for x in (moments.products, moments.sums))
-    mass, total = products.sum(axis=(1, 2)), sums.sum(axis=1)  # the basis' functions add up to 1
+    products, sums = np.asarray(moments.products), np.asarray(moments.sums)
+    # The basis' functions add up to 1.
+    mass, total = products.sum(axis=(1, 2), dtype=np.float64), sums.sum(axis=1, dtype=np.float64)
     num_faces = int(face_of_texel.max()) + 1
     face_mass = np.bincount(face_of_texel, mass, num_faces)
     face_total = np.stack([np.bincount(face_of_texel, column, num_faces) for column in total.T], axis=1)
     face_mean = face_total / np.maximum(face_mass, 1e-9)[:, None]
-    mean = total + FACE_EVIDENCE * face_mean[face_of_texel]
-    mean /= (mass + FACE_EVIDENCE)[:, None]
-    rest = sums - products.sum(axis=2)[:, :, None] * mean[:, None, :]
-    ridge = (RIDGE * mass + FACE_EVIDENCE)[:, None, None] * np.eye(BASIS)
-    return mean[:, None, :] + np.linalg.solve(products + ridge, rest)
+    solved = np.empty_like(sums)
+    for start in range(0, len(sums), SOLVED):
+        block = slice(start, start + SOLVED)
+        mean = total[block] + FACE_EVIDENCE * face_mean[face_of_texel[block]]
+        mean /= (mass[block] + FACE_EVIDENCE)[:, None]
+        system = products[block].astype(np.float64)
+        rest = sums[block] - system.sum(axis=2)[:, :, None] * mean[:, None, :]
+        system += (RIDGE * mass[block] + FACE_EVIDENCE)[:, None, None] * np.eye(BASIS)
+        solved[block] = mean[:, None, :] + np.linalg.solve(system, rest)
+    return solved
 
 
 def baked_parameters(baked: BakedImpostor) -> Parameters:
