@@ -202,7 +202,7 @@ class RenderConfig:
     explore: float = 1 / 16  # share of training's rays that look into all cells nevertheless
     integrate: Literal["color", "features"] = "color"  # Eq. 9, or Eq. 10: one decoded colour a ray
     directions: Literal["world", "rest"] = "world"  # of view; rest: turned back with the tet
-    frame_refinement: float = 1.5  # divides the steps of frames; in training, jitter makes up for long steps
+    frame_refinement: float = 1.25  # divides the steps of frames; in training, jitter makes up for long steps
 
     def __post_init__(self) -> None:
         _require(0 <= self.min_weight < 1, self, "min_weight", "in [0, 1)")
