@@ -5,6 +5,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -177,3 +178,13 @@ def test_step_times_are_medians_of_whole_lines(monkeypatch, tmp_path):
     log = tmp_path / "log.csv"
     log.write_text("step,seconds\n" + "".join(f"{step},{seconds}\n" for step, seconds in lines))
     assert versions.step_ms(log) == pytest.approx(6e3 / 50)
+
+
+def test_compiling_is_clocked_and_running_is_not():
+    clock = importlib.import_module("compile_clock").CompileClock()
+    function = jax.jit(lambda x: jnp.sin(x) @ x)
+    function(jnp.ones((7, 7)))
+    compiled = clock.seconds
+    assert compiled > 0
+    function(jnp.ones((7, 7))).block_until_ready()
+    assert clock.seconds == compiled
