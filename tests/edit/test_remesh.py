@@ -87,6 +87,17 @@ def test_a_local_change_leaves_all_other_tets_their_bits():
     assert_array_equal(index, trained.astype(int))
 
 
+def test_a_whole_new_cage_trains_all_entries_in_order():
+    """Then rows are neither gathered nor scattered."""
+    made = scenes.impostor("delaunay")
+    cells, places = np.full(len(made.mesh.tets), -1), np.broadcast_to(np.eye(4), (len(made.mesh.tets), 4, 4))
+    new, region = with_region(made, made.mesh, cells, places, np.zeros(len(cells), int))
+    assert_array_equal(region.entries, np.arange(len(new.tables.features)))
+    part = trained_part(new, region)
+    part["features"] += 1
+    assert_array_equal(with_trained_part(new, region, part).tables.features, new.tables.features + 1)
+
+
 def test_tables_start_near_the_old_features():
     """The same tets as new ones: levels without collisions can be met, and the other tets keep their bits."""
     made = scenes.impostor("delaunay")

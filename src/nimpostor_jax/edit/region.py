@@ -113,17 +113,28 @@ def _occupied(
     return new if alone else jnp.concatenate([occupied, new])
 
 
+def entries_of(features: Float[Array, "entries F"], region: Region) -> Float[Array, "m F"]:
+    """The region's rows of tables: all of them, in order, where nothing of an old field is left."""
+    return features if _is_all(features, region) else features[region.entries]
+
+
+def _is_all(features: Float[Array, "entries F"], region: Region) -> bool:
+    return region.entries.shape[0] == features.shape[0]
+
+
 def trained_part(impostor: NeuralImpostor, region: Region) -> dict[str, Any]:
     """The region's features and decoders."""
     return {
-        "features": impostor.tables.features[region.entries],
+        "features": entries_of(impostor.tables.features, region),
         "decoders": jax.tree.map(lambda x: x[region.decoder_sets], impostor.decoders),
     }
 
 
 def with_trained_part(impostor: NeuralImpostor, region: Region, part: dict[str, Any]) -> NeuralImpostor:
     """The impostor with its region's features and decoders replaced; all others keep their bits."""
-    features = impostor.tables.features.at[region.entries].set(part["features"])
+    features = part["features"]
+    if not _is_all(impostor.tables.features, region):
+        features = impostor.tables.features.at[region.entries].set(features)
     decoders = jax.tree.map(
         lambda x, new: x.at[region.decoder_sets].set(new), impostor.decoders, part["decoders"]
     )

@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 from nimpostor_jax.config import RenderConfig, RetrainConfig
 from nimpostor_jax.edit.boolean import STEP
 from nimpostor_jax.edit.probe import Points, draw_points, occupancy_of
-from nimpostor_jax.edit.region import Region, trained_part, with_trained_part
+from nimpostor_jax.edit.region import Region, entries_of, trained_part, with_trained_part
 from nimpostor_jax.edit.teacher import pictures_of
 from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.field import impostor as field
@@ -272,7 +272,7 @@ def render_step(
     whole = trainable(with_trained_part(new, region, state.part))
     found, metrics = gradient(whole, new, batch, config)
     gradients = {
-        "features": found["features"][region.entries],
+        "features": entries_of(found["features"], region),
         "decoders": jax.tree.map(lambda x: x[region.decoder_sets], found["decoders"]),
     }
     return _stepped(state, gradients, rates, optimizer), metrics["loss"]
