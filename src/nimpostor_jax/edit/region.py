@@ -123,9 +123,9 @@ def _is_all(features: Float[Array, "entries F"], region: Region) -> bool:
 
 
 def trained_part(impostor: NeuralImpostor, region: Region) -> dict[str, Any]:
-    """The region's features and decoders."""
+    """The region's features and decoders, in arrays of their own: steps consume them."""
     return {
-        "features": entries_of(impostor.tables.features, region),
+        "features": jnp.copy(entries_of(impostor.tables.features, region)),
         "decoders": jax.tree.map(lambda x: x[region.decoder_sets], impostor.decoders),
     }
 
