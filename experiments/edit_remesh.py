@@ -4,8 +4,9 @@
     python experiments/edit_remesh.py --data=DIR --workdir=out/spot --subdivide     # the upper half, 1 to 8
     python experiments/edit_remesh.py --data=DIR --workdir=out/spot                 # a cage made anew
 
-Held-out views judge the field before and after. Writes to --out (default: WORKDIR/remesh) remesh.json,
-impostor.npz, cage.npz, before_after.png (truth, before, after, their difference times 4) and orbit.gif.
+Held-out views judge the field before and after. Writes to --out (default: WORKDIR/remesh) remesh.json
+(`seconds` of the edit without `compile_seconds`), impostor.npz, cage.npz, before_after.png (truth, before,
+after, their difference times 4) and orbit.gif.
 """
 
 import argparse

@@ -154,7 +154,7 @@ def levers(base: RenderConfig) -> list[tuple[str, Any, RenderConfig]]:
     many = {"max_samples_per_ray": 1024}  # no ray is coarsened
     for step in (1 / 2, 1 / 4, 1 / 8, 1 / 12, 1 / 16):
         settings.append(("step", step, sampler(step=step, **many)))
-    for refinement in (1.0, 1.25, 1.5):
+    for refinement in sorted({1.0, 1.25, 1.5} - {base.frame_refinement}):
         settings.append(("refinement", refinement, dataclasses.replace(base, frame_refinement=refinement)))
     for steps in (2, 4, 8):
         settings.append(("alpha", 1 / steps, sampler(measure="alpha", step=1 / steps, **many)))

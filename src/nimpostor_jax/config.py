@@ -354,7 +354,7 @@ class RetrainConfig:
     """
 
     feature_steps: int = 100
-    points_per_batch: int = 1 << 16
+    points_per_batch: int = 1 << 16  # of a step; four times as many at once for the start
     render_steps: int = 250
     rays_per_batch: int = 4096
     views: int = 24  # pictures of the old impostor, from all around the region, that stage 2 trains on

@@ -112,12 +112,12 @@ def test_tables_start_near_the_old_features():
         points = draw(jax.random.key(i), made, source, new, region)
         found = field.features(new, *to_cells(new.embedding, points.tets, points.lambdas))
         off.append(np.mean(np.square(found - points.features), axis=0))
-        new = fit_features(new, region, points)
+        new = fit_features(new, points)
     levels = made.config.encoding.num_levels
     dense = np.asarray(new.tables.layout.rank_starts).size - 1
     first, last = (x.reshape(levels, -1).mean(axis=1) for x in (off[0], off[-1]))
-    assert dense >= 1 and np.all(last[:dense] < 0.02 * first[:dense]), (first, last)
-    assert np.all(last < 0.9 * first), (first, last)  # hashed otherwise than before
+    # 8e-4 of the squared error are left here; how fast it falls depends on where the points are.
+    assert dense == levels and np.all(last < 0.02 * first), (first, last)
     same = np.delete(np.asarray(new.tables.features), region.entries, axis=0)
     assert_array_equal(same, np.delete(np.asarray(start.tables.features), region.entries, axis=0))
 

@@ -12,6 +12,7 @@ from numpy.testing import assert_array_equal
 from rays import as_rays, generic
 from scenes import RENDER
 
+from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.occupancy import (
     cell_index,
@@ -24,7 +25,7 @@ from nimpostor_jax.render.occupancy import (
 )
 from nimpostor_jax.render.renderer import render_rays, render_samples
 from nimpostor_jax.render.sampling import place_samples, plan_samples
-from nimpostor_jax.render.segments import march_segments
+from nimpostor_jax.render.segments import in_cells, march_segments
 from nimpostor_jax.render.selection import present_samples, slabs_of
 
 COUNT = 32
@@ -100,21 +101,25 @@ def test_only_samples_in_occupied_cells_are_rendered():
     np.testing.assert_allclose(kept.color, output.color, atol=1e-5)  # compiled as one, and step by step
 
 
-@pytest.mark.parametrize("measure", ["barycentric", "euclidean"])
-@pytest.mark.parametrize("cone", [0.0, 0.05])
-def test_slabs_leave_out_only_what_cells_would(measure, cone, rng):
-    """The same samples in the end, of fewer that were planned; tets are empty, full, or hold a few cells."""
+@pytest.mark.parametrize("finer", [False, True])
+@pytest.mark.parametrize("measure, cone", [("barycentric", 0.0), ("alpha", 0.0), ("euclidean", 0.05)])
+def test_slabs_leave_out_only_what_cells_would(measure, cone, finer, rng):
+    """The same samples in the end, of fewer that were planned; tets are empty, full, or hold a few cells.
+
+    Also where the mesh is finer than the field whose cells these are.
+    """
     impostor = scenes.impostor("blobs")
     num_tets, step = len(impostor.mesh.tets), 0.02 if measure == "euclidean" else 0.05
     share = rng.choice([0, 0.01, 0.1, 1], (num_tets, 1))
     occupied = jnp.asarray(rng.uniform(size=(num_tets, num_cells(8))) < share)
     impostor = dataclasses.replace(impostor, occupied=occupied)
+    impostor = subdivide(impostor) if finer else impostor
     sampler = dataclasses.replace(RENDER.sampler, measure=measure, step=step, cone_angle=cone)
     sampler = dataclasses.replace(sampler, max_samples_per_ray=256)
     config = dataclasses.replace(RENDER, sampler=sampler, min_weight=0.0)
     rays, _ = view(impostor)
     local = to_local(impostor.mesh, rays)
-    segments = march_segments(impostor.mesh, local, config)
+    segments = in_cells(march_segments(impostor.mesh, local, config), impostor.embedding)
     slabs, kept, planned = slabs_of(impostor, config), [], []
     for those in (None, slabs):
         plan = plan_samples(segments, sampler, measure, slabs=those)

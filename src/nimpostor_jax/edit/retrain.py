@@ -1,8 +1,9 @@
 """Two-stage local retraining (Sec. 4.2, Eq. 12): a region of a new impostor learns what an old one shows.
 
-Stage 1 fits the tables and decoders of the region to the old field at random points: its features, and what
-they are decoded to; stage 2 to pictures of the old impostor, along rays that cross the region. Steps are
-pure, (state, batch) to (state, loss); everything outside the region keeps its bits (`region.py`).
+Tables start from some updates towards the old features (`fit_features`). Stage 1 fits tables and decoders of
+the region to the old field at random points: its features, and what they are decoded to; stage 2 to pictures
+of the old impostor, along rays that cross the region. Steps are pure, (state, batch) to (state, loss);
+everything outside the region keeps its bits (`region.py`).
 
 Axes: M points, R rays, C features.
 """
@@ -84,7 +85,7 @@ def retrain(
     for i in range(START_UPDATES):
         several = START_BATCHES * config.points_per_batch
         points = draw(jax.random.fold_in(key, i), old, source, new, region, count=several)
-        new = fit_features(new, region, points)
+        new = fit_features(new, points)
     state = RetrainState(part=(part := trained_part(new, region)), optimizer=optimizer.init(part))
     rates = {"features": config.feature_rate, "decoders": config.decoder_rate}
     state, losses = _feature_stage(old, source, new, region, draw, config, state, optimizer, rates)
@@ -161,11 +162,11 @@ def _render_stage(
 
 
 @jax.jit
-def fit_features(new: NeuralImpostor, region: Region, points: Points) -> NeuralImpostor:
-    """The region's tables after one update of simultaneous iterative reconstruction towards the old features.
+def fit_features(new: NeuralImpostor, points: Points) -> NeuralImpostor:
+    """A region's tables after one update of simultaneous iterative reconstruction towards the old features.
 
     Each entry moves by the mean, weighted as it is interpolated, of what is missing at the points around it.
-    Some updates come as near to the least squares of Eq. 12's stage 1 as its hashed levels allow.
+    Converges to weighted least squares; levels without collisions meet the old features.
     """
     cells, places = to_cells(new.embedding, points.tets, points.lambdas)
 
@@ -177,8 +178,8 @@ def fit_features(new: NeuralImpostor, region: Region, points: Points) -> NeuralI
     found, pull = jax.vjp(encoded, features)
     weight = jnp.broadcast_to(points.present[:, None], found.shape).astype(found.dtype)
     missing, weights = pull((points.features - found) * weight)[0], pull(weight)[0]
-    moved = features + missing / jnp.where(weights > 0, weights, 1)
-    moved = features.at[region.entries].set(moved[region.entries])
+    near = weights > 0  # none of the entries of other tets
+    moved = jnp.where(near, features + missing / jnp.where(near, weights, 1), features)
     return dataclasses.replace(new, tables=dataclasses.replace(new.tables, features=moved))
 
 

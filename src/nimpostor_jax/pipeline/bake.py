@@ -97,6 +97,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     for batch in batches(DEPTHS_SHARE, "depths"):
         moments = add[add_depths](moments, impostor, layout, batch, config=render)
     depths = tables(moments)
+    del moments
     contents = no_moments(len(faces), 1), no_moments(len(faces), num_features)
     for batch in batches(1.0, "contents"):
         contents = add[add_contents](contents, impostor, depths, batch, config=render)
@@ -111,7 +112,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
         decoder_index=decoder_index,
         config=impostor.config,
     )
-    del contents, moments  # as large as the textures
+    del contents  # as large as the textures
     return refine(baked, pool, train, render, config, log=log)
 
 

@@ -44,7 +44,7 @@ class Samples:
 
 @struct.dataclass
 class SamplePlan:
-    """All samples of all rays, numbered by ray and along the ray: where they are, but not yet what."""
+    """The samples of all rays, numbered by ray and along the ray: where they are, but not yet what."""
 
     segments: TetSegments
     starts: Float[Array, " N"]  # measure of the ray before each segment
