@@ -115,13 +115,13 @@ def test_a_material_lends_its_colours_to_another_shape():
 def test_consolidated_paint():
     live = recolored(scenes.impostor("cube"), FunctionSolid(lower), RED)
     config = RetrainConfig(
-        feature_steps=20, points_per_batch=4096, render_steps=200, rays_per_batch=1024, views=6, view_width=32
+        feature_steps=20, points_per_batch=4096, render_steps=400, rays_per_batch=1024, views=6, view_width=32
     )
     plain = consolidate(live, CONFIG, config, lambda _: None)
     assert not plain.paints
     rays = rays_of()
     error = np.mean((render(plain, rays, CONFIG).color - render(live, rays, CONFIG).color) ** 2)
-    assert -10 * np.log10(error) > 25
+    assert -10 * np.log10(error) > 25  # 24 dB after half of the steps, 26.7 after these
 
 
 def test_bad_input():
