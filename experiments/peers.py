@@ -5,7 +5,7 @@ from functools import partial
 
 import peers_encoding as encoding
 import peers_geometry as geometry
-from peers_match import Comparison, Row, Work, compare
+from peers_match import CORES, Comparison, Row, Work, compare
 
 PACKAGES = ("scipy", "vtk", "pyvista", "open3d", "embreex", "drjit", "torch")
 
@@ -35,7 +35,11 @@ COMPARISONS: dict[str, Comparison] = {
 
 def compare_all(work: Work, only: Sequence[str] = ()) -> Iterator[Row]:
     """Rows in order, of the comparisons whose names contain one of `only` (of all where it is empty)."""
-    batches = {f"traverse_batch_{n}": partial(geometry.traverse_batch, n) for n in work.batches}
+    batches = {
+        f"traverse_batch_{count}{name}": partial(geometry.traverse_batch, count, threads)
+        for name, threads in (("", CORES), ("_one_thread", 1))
+        for count in work.batches
+    }
     for name, comparison in (COMPARISONS | batches).items():
         if not only or any(part in name for part in only):
             yield compare(name, comparison, work)

@@ -138,13 +138,21 @@ def traverse_ball_frame_one_thread(work: Work) -> Match:
     return Match(march, None, lambda ours, _: _march_facts(work, mesh, rays, ours), ours_threads=1)
 
 
-def traverse_batch(count: int, work: Work) -> Match:
-    """`count` rays a call: tiles drawn from a large frame, so that a tile is alike in all batches."""
+def traverse_batch(count: int, threads: int, work: Work) -> Match:
+    """`count` rays a call: tiles of a large frame, evenly from those with few tets to those with many.
+
+    Drawn at random, the few tiles of a small batch would have other segments than those of a large one.
+    """
     mesh = cage_of(work)[2]
     rays = frame_rays(1 << ((max(work.batches) - 1).bit_length() + 1) // 2)
-    tiles = np.random.default_rng(0).permutation(len(rays.origins) // TILE**2)[: count // TILE**2]
-    rays = jax.tree.map(lambda x: np.asarray(x).reshape(-1, TILE**2, 3)[tiles].reshape(-1, 3), rays)
-    return Match(_marching(mesh, rays), None, lambda ours, _: _march_facts(work, mesh, rays, ours))
+    tiles = jax.tree.map(lambda x: np.asarray(x).reshape(-1, TILE**2, 3), rays)
+    crossed = np.asarray(_marching(mesh, rays)().codes >= 0).sum(axis=0).reshape(-1, TILE**2).sum(axis=1)
+    places = (np.arange(count // TILE**2) + 0.5) * len(crossed) / (count // TILE**2)
+    chosen = np.argsort(crossed, kind="stable")[places.astype(int)]
+    chosen = np.concatenate([chosen[i::CORES] for i in range(CORES)])  # alike for each of the devices
+    rays = jax.tree.map(lambda x: x[chosen].reshape(-1, 3), tiles)
+    march = _marching(mesh, rays, threads)
+    return Match(march, None, lambda ours, _: _march_facts(work, mesh, rays, ours), ours_threads=threads)
 
 
 def _against_open3d(work: Work, rays: Rays) -> Match:

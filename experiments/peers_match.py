@@ -42,6 +42,7 @@ class Work:
     """How much each comparison computes. Counts are multiples of powers of two (`devices_for`)."""
 
     repeats: int = 7
+    min_seconds: float = 0.5  # of all repeats: short calls are repeated more often
     points: int = 1 << 18  # point queries
     slow_points: int = 1 << 15  # the same, of peers that take microseconds each
     rays: int = 1 << 16
@@ -80,15 +81,23 @@ def compare(name: str, comparison: Comparison, work: Work) -> Row:
     except (ImportError, Absent) as error:
         return {"name": name, "absent": f"{type(error).__name__}: {error}"}
     sides = {"ours": match.ours, "peer": match.peer}
-    results: dict[str, Any] = {}
+    results: dict[str, Any] = dict.fromkeys(sides)
     clocks: dict[str, list[tuple[float, float]]] = {side: [] for side in sides}
-    for _ in range(1 + work.repeats):
+    began, turns = np.inf, 0
+    while turns <= work.repeats or time.perf_counter() - began < work.min_seconds:
         for side, call in sides.items():  # in turns: whatever else the machine does meets both
+            if call is None:
+                continue
+            if clocks[side]:
+                call()  # untimed: caches that the other side has filled, its threads that still look for work
             start, used = time.perf_counter(), time.process_time()
-            results[side] = call() if call else None
+            results[side] = call()
             clocks[side].append((time.perf_counter() - start, time.process_time() - used))
+        began, turns = min(began, time.perf_counter()), turns + 1
     wall, cpu, first = {}, {}, {}
     for side, times in clocks.items():
+        if not times:
+            continue
         wall[side], cpu[side] = np.median(times[1:], axis=0).tolist()
         first[side] = max(0.0, times[0][0] - wall[side])
     row: Row = {"name": name, "ours_ms": 1e3 * wall["ours"], "ours_cpu_ms": 1e3 * cpu["ours"]}

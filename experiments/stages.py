@@ -8,6 +8,7 @@ whole. Medians, without compilation; `page_faults` should be 0 after the first c
 """
 
 import argparse
+import dataclasses
 import resource
 import time
 from collections.abc import Callable, Sequence
@@ -29,9 +30,9 @@ from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order, to
 from nimpostor_jax.render.capacity import ray_entries
 from nimpostor_jax.render.frame import CHUNK, frame_config
 from nimpostor_jax.render.renderer import integrate_samples, render_rays
-from nimpostor_jax.render.sampling import place_samples, plan_samples
+from nimpostor_jax.render.sampling import SamplePlan, place_samples, plan_samples
 from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.selection import present_samples, slabs_of, visible_samples
+from nimpostor_jax.render.selection import in_order, present_samples, slabs_of, visible_samples
 from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.step import RayBatch, loss_gradient, make_optimizer, trainable
@@ -90,7 +91,7 @@ def timed(kind: str, stage: str, function: Callable, *arguments: Any) -> tuple[R
         faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
     row = {"rays": kind, "stage": stage, "cpu_ms": 1e3 * float(np.median(times))}
     row["page_faults"] = int(np.median(faults))
-    print(f"{kind:9s} {stage:12s} {row['cpu_ms']:8.2f} ms  {row['page_faults']} page faults", flush=True)
+    print(f"{kind:9s} {stage:15s} {row['cpu_ms']:8.2f} ms  {row['page_faults']} page faults", flush=True)
     return row, result
 
 
@@ -121,6 +122,7 @@ def render_stages(
     )  # fmt: skip
     plan, chosen, count = stage("cells", lambda i, p: present_samples(i, p, config), impostor, plan)
     numbers = {"planned": int(plan.num_used), "in occupied cells": int(count)}
+    stage("if tets overlap", in_order, as_if_overlapping(plan), chosen, count)
     features = None
     if config.min_weight > 0:
         look = lambda i, p, c, n: visible_samples(i, p, c, n, config, None)  # noqa: E731
@@ -139,6 +141,12 @@ def render_stages(
     )  # fmt: skip
     print(f"{kind}: samples {numbers}")
     return [row | {"samples": numbers} for row in rows]
+
+
+def as_if_overlapping(plan: SamplePlan) -> SamplePlan:
+    """The plan as of rays whose tets overlap, whose samples must be sorted: what others are spared."""
+    segments = plan.segments.replace(disordered=jnp.ones_like(plan.segments.disordered))
+    return dataclasses.replace(plan, segments=segments)
 
 
 def training_stages(impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig) -> list[Row]:

@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import sys
+from functools import partial
 from pathlib import Path
 
 import jax
@@ -120,7 +121,16 @@ def peers(monkeypatch):
     return importlib.import_module("peers"), importlib.import_module("peers_match")
 
 
-SMALL_WORK = dict(repeats=1, points=256, slow_points=64, rays=256, slow_rays=64, checked_rays=64, batches=())
+SMALL_WORK = dict(
+    repeats=1,
+    min_seconds=0.0,
+    points=256,
+    slow_points=64,
+    rays=256,
+    slow_rays=64,
+    checked_rays=64,
+    batches=(),
+)
 SMALL_TABLES = dict(encoded=256, num_levels=4, log2_table=10)
 
 
@@ -154,9 +164,23 @@ def test_sides_are_timed_in_turns(peers):
     _, match = peers
     calls = []
     sides = match.Match(lambda: calls.append("ours"), lambda: calls.append("peer"))
-    row = match.compare("turns", lambda work: sides, match.Work(repeats=3))
-    assert calls == ["ours", "peer"] * 4  # the first compiles
+    row = match.compare("turns", lambda work: sides, match.Work(repeats=3, min_seconds=0.0))
+    warmed = ["ours"] * 2 + ["peer"] * 2  # an untimed call before each that is timed
+    assert calls == ["ours", "peer"] + warmed * 3  # the first compiles
     assert row["name"] == "turns" and row["ratio"] > 0
+
+
+def test_small_batches_hold_tiles_like_those_of_large_ones(peers):
+    """Of a few tiles drawn at random, most might miss the cage."""
+    _, match = peers
+    vertices, tets = importlib.import_module("stress_meshes").kuhn_grid(2, 2, 2)
+    cage, geometry = (vertices.astype(np.float64), tets), importlib.import_module("peers_geometry")
+    work = match.Work(**SMALL_WORK | dict(batches=(1 << 14,)), cage=lambda: cage)
+    batches = [partial(geometry.traverse_batch, count, 1) for count in (1 << 11, 1 << 14)]
+    rows = [match.compare("batch", batch, work) for batch in batches]
+    small, large = (row["segments"] / row["rays"] for row in rows)
+    assert small == pytest.approx(large, rel=0.1) and large > 1
+    assert not any(row["lost"] for row in rows)
 
 
 def test_float64_chords_add_up(peers):

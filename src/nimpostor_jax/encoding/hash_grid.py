@@ -76,6 +76,7 @@ def _encode(
     """Weighted sums of table rows: one gather a corner, accumulated, is what XLA's CPU back end does best.
 
     All chunks of a level come before the next level: its entries come into the cache once, not per chunk.
+    Levels are put side by side at the end: written there at once, each would touch every cache line.
     """
     if known is not None:
         return known
@@ -88,14 +89,19 @@ def _encode(
             weights, nodes = corners(part.coordinates)
             rows = (_rows(features, address(part, node)) for node in nodes)
             total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
-            return jax.lax.dynamic_update_slice(out, jnp.expand_dims(total, 1), (start, level, jnp.int32(0)))
+            return jax.lax.dynamic_update_slice(out, total[None], (level, start, jnp.int32(0)))
 
         return for_chunks(num_used, chunk, encode_chunk, out)
 
-    shape = (tet_ids.shape[0], config.num_levels, features.shape[1])
+    shape = (config.num_levels, tet_ids.shape[0], features.shape[1])
     zeros = jnp.zeros(shape, jnp.result_type(features, lambdas))
-    out = _for_levels(config, grid, first_level, add_level, zeros)
-    return out.reshape(shape[0], -1)
+    by_level = _for_levels(config, grid, first_level, add_level, zeros)
+
+    def join_chunk(start: Array, out: Array) -> Array:
+        part = jax.lax.dynamic_slice_in_dim(by_level, start, chunk, axis=1)
+        return put(out, start, part.transpose(1, 0, 2).reshape(chunk, -1))
+
+    return for_chunks(num_used, chunk, join_chunk, jnp.zeros((shape[1], shape[0] * shape[2]), zeros.dtype))
 
 
 def _encode_forward(

@@ -31,6 +31,7 @@ from nimpostor_jax.render.entries import MarchTables, met_at, search_entries, si
 from nimpostor_jax.types import Rays, TetMesh
 
 CPU_TILE = 256  # an image tile: a larger one has a wider cone and waits longer for its last ray
+CPU_CAREFUL_TILE = 16  # of the few rays that are marched again
 CODES_PER_TET = 36
 
 
@@ -162,7 +163,8 @@ def traverse(
         found = jax.lax.fori_loop(0, num_tiles, march, found)
     rows, overflow, unsure = jax.tree.map(lambda x: x[..., : tiles.num_rays], found)
     crossings = Crossings(codes=rows[0], ends=rows[1], overflow=overflow | entries.overflow)
-    return _march_again(tables, rays, config, crossings, unsure | entries.unsure, tiles.size)
+    tile = min(tiles.size, CPU_CAREFUL_TILE) if jax.default_backend() == "cpu" else tiles.size
+    return _march_again(tables, rays, config, crossings, unsure | entries.unsure, tile)
 
 
 def _empty_rows(slots: int, lanes: int, dtype: Any) -> tuple[Int[Array, "K lanes"], Ends]:
