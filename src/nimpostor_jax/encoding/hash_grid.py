@@ -89,7 +89,7 @@ def _encode(
             weights, nodes = corners(part.coordinates)
             rows = (_rows(features, address(part, node)) for node in nodes)
             total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
-            return jax.lax.dynamic_update_slice(out, total[None], (level, start, jnp.int32(0)))
+            return jax.lax.dynamic_update_slice(out, jnp.expand_dims(total, 0), (level, start, jnp.int32(0)))
 
         return for_chunks(num_used, chunk, encode_chunk, out)
 
