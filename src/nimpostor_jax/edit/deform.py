@@ -53,7 +53,14 @@ def deform(impostor: NeuralImpostor, space_map: SpaceMap) -> NeuralImpostor:
 
 
 def with_vertices(impostor: NeuralImpostor, vertices: Float[Array, "V 3"]) -> NeuralImpostor:
-    """The impostor with its vertices, in the mesh's frame, elsewhere; remembers where they were at rest."""
+    """The impostor with its vertices, in the mesh's frame, elsewhere; remembers where they were at rest.
+
+    Outside jit, one that was at rest and of which none moves is given back as it is: it has not turned, and
+    renders by the same program to the same bits, with `directions` "rest" too.
+    """
+    known = not any(isinstance(x, jax.core.Tracer) for x in (vertices, impostor.mesh.vertices))
+    if known and impostor.rest_vertices is None and np.array_equal(vertices, impostor.mesh.vertices):
+        return impostor
     rest = impostor.mesh.vertices if impostor.rest_vertices is None else impostor.rest_vertices
     mesh = dataclasses.replace(impostor.mesh, vertices=vertices)
     return dataclasses.replace(impostor, mesh=mesh, rest_vertices=rest)
