@@ -2,8 +2,9 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -39,6 +40,7 @@ from nimpostor_jax.train.step import RayBatch, make_optimizer
 from nimpostor_jax.types import BakedImpostor, HashTables, NeuralImpostor, TetMesh
 
 FIT_RAYS = 8192  # a call
+SYNC_EVERY = 2  # calls that may be under way at once: each has its buffers from the start
 FIT_REFINEMENT = 4.0  # of training's steps: tets are small, and each should get some samples
 LOOK_SHARE, DEPTHS_SHARE = 0.25, 0.5  # of the rays: for what is visible at all, and how deep it lies
 FINAL_RATE = 0.1  # of the learning rate, at the end of the refinement
@@ -68,18 +70,21 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
     render = fit_config(mesh, pool, probe, with_step(scene.config.render, impostor.config.encoding))
 
-    def batches(share: float, text: str) -> Iterator[RayBatch]:
-        count = -(-round(share * config.fit_rays) // len(probe.jitter))
-        for i in tqdm(range(count), desc=text, unit="batch", disable=None):
-            yield draw_batch(key, i, pool, len(probe.jitter), "white")
-
     add = {
         function: jax.jit(function, static_argnames="config", donate_argnums=0)
         for function in (add_visible, add_depths, add_contents)
     }
-    found = jnp.zeros((len(mesh.tets), 2))
-    for batch in batches(LOOK_SHARE, "look"):
-        found = add[add_visible](found, impostor, batch, config=render)
+
+    def add_up(sums: Any, function: Callable[..., Any], share: float, text: str, *shared: Any) -> Any:
+        count = -(-round(share * config.fit_rays) // len(probe.jitter))
+        for i in tqdm(range(count), desc=text, unit="batch", disable=None):
+            batch = draw_batch(key, i, pool, len(probe.jitter), "white")
+            sums = add[function](sums, impostor, *shared, batch, config=render)
+            if i % SYNC_EVERY == 0:
+                jax.block_until_ready(sums)
+        return sums
+
+    found = add_up(jnp.zeros((len(mesh.tets), 2)), add_visible, LOOK_SHARE, "look")
     light, taken = np.asarray(found).T
     shown = taken > config.min_opacity * np.maximum(light, 1)
     resolutions = np.clip(np.ceil(config.texels_per_pixel * pixels), 1, config.max_resolution)
@@ -93,14 +98,9 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
         texels = np.concatenate([solve_moments(part, faces) for part in moments], axis=2)
         return HashTables(features=jnp.asarray(texels.reshape(len(faces), -1)), layout=layout)
 
-    moments = no_moments(len(faces), 1)
-    for batch in batches(DEPTHS_SHARE, "depths"):
-        moments = add[add_depths](moments, impostor, layout, batch, config=render)
-    depths = tables(moments)
-    del moments
+    depths = tables(add_up(no_moments(len(faces), 1), add_depths, DEPTHS_SHARE, "depths", layout))
     contents = no_moments(len(faces), 1), no_moments(len(faces), num_features)
-    for batch in batches(1.0, "contents"):
-        contents = add[add_contents](contents, impostor, depths, batch, config=render)
+    contents = add_up(contents, add_contents, 1.0, "contents", depths)
     decoder_index = impostor.decoder_index
     if impostor.embedding is not None:
         decoder_index = decoder_index[impostor.embedding.cells]
@@ -175,6 +175,8 @@ def refine(
         rate = config.learning_rate * FINAL_RATE ** (i / config.refine_steps)
         parameters, state, loss = compiled(parameters, state, baked, batch, jnp.float32(rate))
         losses.append(loss)
+        if i % SYNC_EVERY == 0:
+            jax.block_until_ready(loss)
     first, last = (np.mean([float(x) for x in part]) for part in (losses[:20], losses[-20:]))
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
     return with_baked_parameters(baked, parameters)
