@@ -328,7 +328,7 @@ class BakeConfig:
     texels_per_pixel: float = 0.7  # along an edge, at the training views' distance
     max_resolution: int = 256  # texels along an edge
     min_opacity: float = 2e-3  # of a tet, on average over the light that reaches it; less is left out
-    max_megabytes: int = 1024  # of textures; more is refused, and refining them takes eight times as much
+    max_megabytes: int = 1024  # of textures; more is refused. Refining them holds several copies
     fit_rays: int = 2_000_000
     refine_steps: int = 500
     refine_decoders: bool = True

@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import for_chunks, padded_size, take
+from nimpostor_jax.chunks import default_chunk, for_chunks, padded_size, take
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry import box_tree
 from nimpostor_jax.geometry.intersect import project, ray_frame
@@ -163,7 +163,7 @@ def traverse(
         found = jax.lax.fori_loop(0, num_tiles, march, found)
     rows, overflow, unsure = jax.tree.map(lambda x: x[..., : tiles.num_rays], found)
     crossings = Crossings(codes=rows[0], ends=rows[1], overflow=overflow | entries.overflow)
-    tile = min(tiles.size, CPU_CAREFUL_TILE) if jax.default_backend() == "cpu" else tiles.size
+    tile = default_chunk(tiles.size, CPU_CAREFUL_TILE)
     return _march_again(tables, rays, config, crossings, unsure | entries.unsure, tile)
 
 
