@@ -75,10 +75,13 @@ def search_entries(
         hit &= (a[0] != b[0]) | (a[1] != b[1])  # seen as a point, a face has no left and right
         for passed, doubt in zip(left, close, strict=True):
             possible &= ~passed | doubt
-        met, flat = met_at(a, b, c, careful)
-        t = jnp.where(hit, met[0], jnp.inf)
-        unsure |= (possible & (close[0] | close[1] | close[2])) | (hit & flat)
-        return unsure, jax.lax.cond(jnp.any(hit), lambda: _insert(found, t, hold), lambda: found)
+        unsure |= possible & (close[0] | close[1] | close[2])
+
+        def insert() -> tuple:
+            met, flat = met_at(a, b, c, careful)
+            return unsure | (hit & flat), _insert(found, jnp.where(hit, met[0], jnp.inf), hold)
+
+        return jax.lax.cond(jnp.any(hit), insert, lambda: (unsure, found))
 
     empty = (
         jnp.full((slots, lanes), jnp.inf, dtype),

@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import default_chunk, for_chunks, padded_size, take
+from nimpostor_jax.chunks import default_chunk, for_chunks, packed_indices, padded_size, take
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry import box_tree
 from nimpostor_jax.geometry.intersect import project, ray_frame
@@ -202,11 +202,15 @@ def _march_again(
     """The crossings, with those of unsure rays from careful marches: rare, and several times slower."""
     num_rays = unsure.shape[0]
     lines = jax.lax.stop_gradient((rays.origins, rays.directions))
-    again = jnp.nonzero(unsure, size=padded_size(num_rays, tile), fill_value=num_rays)[0]
+    indices, count = packed_indices(unsure)
+    again = jnp.where(jnp.arange(num_rays) < count, indices, num_rays)
+    again = jnp.pad(again, (0, padded_size(num_rays, tile) - num_rays), constant_values=num_rays)
 
     def march(start: Array, found: Crossings) -> Crossings:
-        chosen = take(again, start, tile)  # past the end: read the last ray, write nothing
-        origins, directions = (x.at[chosen].get(mode="clip").T for x in lines)
+        chosen = take(again, start, tile)
+        # Past the end: the tile's first ray once more, which widens no cone, and nothing is written.
+        read = jnp.where(chosen < num_rays, chosen, chosen[0])
+        origins, directions = (x[read].T for x in lines)
         holds, count, _ = search_entries(tables, config, True, *_frame(origins, directions))
         rows = _empty_rows(config.max_tets_per_ray, tile, origins.dtype)
         (codes, ends), overflow, _ = _march_tile(tables, config, True, origins, directions, holds, rows, 0)
@@ -219,7 +223,7 @@ def _march_again(
             overflow=found.overflow.at[chosen].set(overflow, mode="drop"),
         )
 
-    return for_chunks(jnp.sum(unsure, dtype=jnp.int32), tile, march, crossings) if num_rays else crossings
+    return for_chunks(count, tile, march, crossings) if num_rays else crossings
 
 
 def _march_tile(
@@ -271,7 +275,10 @@ def _march_tile(
         first = _choose(exit_slot, b, c, a)
         second = _choose(exit_slot, c, a, b)
         met_after, flat = met_at(new, first, second, careful)
-        unsure |= active & (close[0] | close[1] | close[2] | flat)
+        # Two tests decide. The third may be close, as that of an edge that points to the camera is.
+        third = (exit_slot == 2) & left[1] & ~left[0]
+        doubt = (close[0] & (exit_slot != 0)) | (close[1] & (exit_slot != 1)) | (close[2] & ~third)
+        unsure |= active & (doubt | flat)
         values = code, (*met, *met_after)
         rows = jax.tree.map(
             lambda row, value: jax.lax.dynamic_update_slice(row, value[None], (slot, column)), rows, values
