@@ -251,15 +251,18 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
     camera = first_camera(scene, size)
     full = scene.config.render
     every_cell = dataclasses.replace(full, skip_empty=False)
+    sorting = dataclasses.replace(full, skip_sorting=False)
+    everything = dataclasses.replace(every_cell, skip_sorting=False)
     merged = for_frames(impostor)
     settings: dict[str, tuple[NeuralImpostor, RenderConfig, dict[str, float], bool]] = {
         "": (merged, full, {}, False),
         "_with_single_levels": (impostor, full, {}, False),
         "_with_empty_cells": (merged, every_cell, {}, False),
+        "_with_sorting": (merged, sorting, {}, False),
         "_in_one_pass": (merged, full, {"min_weight": 0.0}, False),
         "_in_two_passes": (merged, full, {"min_weight": full.min_weight / full.frame_refinement}, False),
         "_with_empty_pixels": (merged, full, {}, True),
-        "_with_everything": (impostor, every_cell, {"min_weight": 0.0}, True),
+        "_with_everything": (impostor, everything, {"min_weight": 0.0}, True),
     }
     calls, images, times = {}, {}, {}
     pixels = np.arange(camera.width * camera.height)

@@ -30,7 +30,7 @@ from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order, to
 from nimpostor_jax.render.capacity import ray_entries
 from nimpostor_jax.render.frame import CHUNK, frame_config
 from nimpostor_jax.render.renderer import integrate_samples, render_rays
-from nimpostor_jax.render.sampling import SamplePlan, place_samples, plan_samples
+from nimpostor_jax.render.sampling import place_samples, plan_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.selection import in_order, present_samples, slabs_of, visible_samples
 from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
@@ -122,7 +122,8 @@ def render_stages(
     )  # fmt: skip
     plan, chosen, count = stage("cells", lambda i, p: present_samples(i, p, config), impostor, plan)
     numbers = {"planned": int(plan.num_used), "in occupied cells": int(count)}
-    stage("if tets overlap", in_order, as_if_overlapping(plan), chosen, count)
+    sort_all = dataclasses.replace(config, skip_sorting=False)
+    stage("if tets overlap", lambda p, c, n: in_order(p, c, n, sort_all), plan, chosen, count)
     features = None
     if config.min_weight > 0:
         look = lambda i, p, c, n: visible_samples(i, p, c, n, config, None)  # noqa: E731
@@ -141,12 +142,6 @@ def render_stages(
     )  # fmt: skip
     print(f"{kind}: samples {numbers}")
     return [row | {"samples": numbers} for row in rows]
-
-
-def as_if_overlapping(plan: SamplePlan) -> SamplePlan:
-    """The plan as of rays whose tets overlap, whose samples must be sorted: what others are spared."""
-    segments = plan.segments.replace(disordered=jnp.ones_like(plan.segments.disordered))
-    return dataclasses.replace(plan, segments=segments)
 
 
 def training_stages(impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig) -> list[Row]:

@@ -31,7 +31,7 @@ def present_samples(
     """
     chosen, num_used = gated_samples(impostor, plan, *occupied_samples(impostor, plan, config))
     plan, chosen, num_used = _limited(plan, chosen, num_used, config.sampler.occupied_per_ray)
-    return plan, in_order(plan, chosen, num_used), num_used
+    return plan, in_order(plan, chosen, num_used, config), num_used
 
 
 def _limited(
@@ -114,11 +114,13 @@ def _passes(impostor: NeuralImpostor, part: tuple) -> Bool[Array, " chunk"]:
     return is_kept(impostor, *part)
 
 
-def in_order(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""]) -> Int[Array, " M"]:
+def in_order(
+    plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""], config: RenderConfig
+) -> Int[Array, " M"]:
     """The chosen samples along each ray, also where tets overlap (Fig. 4, intersecting).
 
     Each entry into a cage starts a walk of its own, so that only samples of different walks can be out of
-    order. Where no two segments overlap, nothing is sorted.
+    order. Where no two segments overlap, nothing is sorted, unless the config says so.
     """
     frozen = jax.lax.stop_gradient(plan)
 
@@ -128,7 +130,8 @@ def in_order(plan: SamplePlan, chosen: Int[Array, " M"], num_used: Int[Array, ""
         rays = jnp.where(order < num_used, rays, jnp.iinfo(rays.dtype).max)
         return jax.lax.sort((rays, t, chosen), num_keys=2)[2]  # stable: of equals, the first walk's
 
-    return jax.lax.cond(jnp.any(frozen.segments.disordered), sort, lambda: chosen)
+    disordered = jnp.any(frozen.segments.disordered) | (not config.skip_sorting)
+    return jax.lax.cond(disordered, sort, lambda: chosen)
 
 
 def _t_and_ray(plan: SamplePlan, items: tuple) -> tuple[Float[Array, " chunk"], Int[Array, " chunk"]]:
