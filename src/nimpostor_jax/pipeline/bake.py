@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from tqdm.auto import tqdm
 
+from nimpostor_jax.chunks import padded_size
 from nimpostor_jax.config import BakeConfig, RenderConfig, TrainConfig
 from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.encoding.face_grid import NO_TEXELS, build_face_layout, num_texels
@@ -36,6 +37,7 @@ from nimpostor_jax.train.bake import (
     with_baked_parameters,
 )
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
+from nimpostor_jax.train.sharding import device_mesh, over_rays, replicated, sums_by_device
 from nimpostor_jax.train.step import RayBatch, make_optimizer
 from nimpostor_jax.types import BakedImpostor, HashTables, NeuralImpostor, TetMesh
 
@@ -70,22 +72,28 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
     render = fit_config(mesh, pool, probe, with_step(scene.config.render, impostor.config.encoding))
 
-    add = {
-        function: jax.jit(function, static_argnames="config", donate_argnums=0)
-        for function in (add_visible, add_depths, add_contents)
-    }
+    devices = device_mesh()
 
-    def add_up(sums: Any, function: Callable[..., Any], share: float, text: str, *shared: Any) -> Any:
-        count = -(-round(share * config.fit_rays) // len(probe.jitter))
+    def add_up(start: Callable[[], Any], add: Callable[..., Any], share: float, text: str, *more: Any) -> Any:
+        """Sums over rays, on the host; each device adds up its own."""
+        compiled = jax.jit(sums_by_device(devices, add), static_argnames="config", donate_argnums=0)
+        shared = jax.device_put((impostor, *more), replicated(devices))
+        size = padded_size(len(probe.jitter), devices.size)
+
+        @partial(jax.jit, out_shardings=over_rays(devices))
+        def no_sums() -> Any:
+            return jax.tree.map(lambda x: jnp.broadcast_to(x, (devices.size, *x.shape)), start())
+
+        sums, count = no_sums(), -(-round(share * config.fit_rays) // size)
         for i in tqdm(range(count), desc=text, unit="batch", disable=None):
-            batch = draw_batch(key, i, pool, len(probe.jitter), "white")
-            sums = add[function](sums, impostor, *shared, batch, config=render)
+            batch = jax.device_put(draw_batch(key, i, pool, size, "white"), over_rays(devices))
+            sums = compiled(sums, *shared, batch, config=render)
             if i % SYNC_EVERY == 0:
                 jax.block_until_ready(sums)
-        return sums
+        return jax.tree.map(lambda x: np.asarray(x).sum(axis=0), sums)
 
-    found = add_up(jnp.zeros((len(mesh.tets), 2)), add_visible, LOOK_SHARE, "look")
-    light, taken = np.asarray(found).T
+    found = add_up(lambda: jnp.zeros((len(mesh.tets), 2)), add_visible, LOOK_SHARE, "look")
+    light, taken = found.T
     shown = taken > config.min_opacity * np.maximum(light, 1)
     resolutions = np.clip(np.ceil(config.texels_per_pixel * pixels), 1, config.max_resolution)
     resolutions = np.where(shown[:, None], resolutions, 0).astype(np.int64)
@@ -98,9 +106,11 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
         texels = np.concatenate([solve_moments(part, faces) for part in moments], axis=2)
         return HashTables(features=jnp.asarray(texels.reshape(len(faces), -1)), layout=layout)
 
-    depths = tables(add_up(no_moments(len(faces), 1), add_depths, DEPTHS_SHARE, "depths", layout))
-    contents = no_moments(len(faces), 1), no_moments(len(faces), num_features)
-    contents = add_up(contents, add_contents, 1.0, "contents", depths)
+    def no_contents() -> tuple[Moments, Moments]:
+        return no_moments(len(faces), 1), no_moments(len(faces), num_features)
+
+    depths = tables(add_up(partial(no_moments, len(faces), 1), add_depths, DEPTHS_SHARE, "depths", layout))
+    contents = add_up(no_contents, add_contents, 1.0, "contents", depths)
     decoder_index = impostor.decoder_index
     if impostor.embedding is not None:
         decoder_index = decoder_index[impostor.embedding.cells]

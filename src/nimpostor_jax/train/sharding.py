@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 from jax.sharding import AxisType, Mesh, NamedSharding
@@ -39,6 +40,25 @@ def data_parallel(mesh: Mesh) -> Callable[..., tuple[Parameters, Metrics]]:
         return shard(parameters, impostor, batch)
 
     return gradient
+
+
+def sums_by_device(mesh: Mesh, add: Callable[..., Any]) -> Callable[..., Any]:
+    """`add(sums, *shared, batch, config)`, where each device adds its share of the rays to sums of its own.
+
+    These have a leading axis over devices. Their number must divide that of the rays.
+    """
+
+    def add_all(sums: Any, *arguments: Any, config: RenderConfig) -> Any:
+        specs = (P(AXIS), *[P()] * (len(arguments) - 1), P(AXIS))
+
+        @partial(jax.shard_map, mesh=mesh, in_specs=specs, out_specs=P(AXIS), check_vma=False)
+        def shard(sums: Any, *arguments: Any) -> Any:
+            own = jax.tree.map(lambda x: x[0], sums)
+            return jax.tree.map(lambda x: x[None], add(own, *arguments, config))
+
+        return shard(sums, *arguments)
+
+    return add_all
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
