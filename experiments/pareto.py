@@ -167,8 +167,9 @@ def levers(base: RenderConfig) -> list[tuple[str, Any, RenderConfig]]:
     for weight in (1e-4, 1e-3, 1e-2):
         settings.append(("min_weight", weight, dataclasses.replace(base, min_weight=weight)))
     settings.append(("skips", "not empty", dataclasses.replace(base, skip_empty=False)))
-    settings.append(("skips", "not sorting", dataclasses.replace(base, skip_sorting=False)))
-    settings.append(("skips", "none", dataclasses.replace(base, skip_empty=False, min_weight=0.0)))
+    settings.append(("skips", "all sorted", dataclasses.replace(base, skip_sorting=False)))
+    none = dataclasses.replace(base, skip_empty=False, skip_sorting=False, min_weight=0.0)
+    settings.append(("skips", "none", none))
     settings.append(("tables", "bfloat16", base))
     for tolerance in (4 / 255, 1 / 255):
         settings.append(("tolerance", tolerance, base))

@@ -16,14 +16,15 @@ from nimpostor_jax import chunks
 from nimpostor_jax.config import MarchConfig, SamplerConfig
 from nimpostor_jax.edit.compose import compose
 from nimpostor_jax.io.impostor_file import save_impostor
-from nimpostor_jax.render import capacity
+from nimpostor_jax.render import capacity, selection
 from nimpostor_jax.render import frame as frames
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
 from nimpostor_jax.render.capacity import fit_capacities, ray_entries
 from nimpostor_jax.render.frame import for_frames, frame_config, refined, render_frame, to_image
 from nimpostor_jax.render.occupancy import num_cells
 from nimpostor_jax.render.renderer import render_rays
-from nimpostor_jax.render.sampling import step_boundaries
+from nimpostor_jax.render.sampling import plan_samples, step_boundaries
+from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
 from nimpostor_jax.train.step import trainable
 
@@ -113,6 +114,20 @@ def test_merged_levels_are_for_frames_only(scene, tmp_path):
 def partly_occupied(impostor, share):
     parts = np.random.default_rng(0).random((len(impostor.mesh.tets), num_cells(4))) < share
     return impostor.replace(occupied=jax.numpy.asarray(parts))
+
+
+def test_sorting_what_is_in_order_changes_nothing(scene):
+    impostor, camera = scene
+    rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2))
+    always = dataclasses.replace(RENDER, skip_sorting=False)
+    expected, sorted_ = (render(impostor, rays, config) for config in (RENDER, always))
+    assert_allclose(sorted_.color, expected.color, atol=1e-6)  # another program, fused otherwise
+    # That it sorts: samples given out of order come back in order
+    order = jnp.asarray([3, 1, 2, 0], jnp.int32)
+    local = to_local(impostor.mesh, rays)
+    plan = plan_samples(march_segments(impostor.mesh, local, RENDER), RENDER.sampler, "barycentric")
+    assert_array_equal(selection.in_order(plan, order, jnp.int32(4), RENDER), order)
+    assert_array_equal(selection.in_order(plan, order, jnp.int32(4), always), jnp.sort(order))
 
 
 def test_buffers_behind_the_occupancy_are_smaller(scene):

@@ -264,14 +264,14 @@ def test_an_edge_that_points_to_the_camera_needs_no_care(rng, monkeypatch):
     again = traversal._march_again
 
     def watched(tables, rays, config, found, unsure, tile):
-        seen.append((found.codes, int(unsure.sum())))
+        seen.append((found.codes, np.asarray(unsure)))
         return again(tables, rays, config, found, jnp.ones_like(unsure), tile)
 
     monkeypatch.setattr(traversal, "_march_again", watched)
     careful = traverse(tables, rays, CONFIG).codes
     ((quick, unsure),) = seen
-    assert unsure <= COUNT // 10  # half of them, if ties counted
-    assert_array_equal(quick, careful)
+    assert unsure.sum() <= COUNT // 10  # half of them, if ties counted
+    assert_array_equal(quick[:, ~unsure], careful[:, ~unsure])
 
 
 def test_no_rays_give_no_segments():

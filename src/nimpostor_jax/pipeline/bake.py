@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from tqdm.auto import tqdm
 
-from nimpostor_jax.chunks import padded_size
 from nimpostor_jax.config import BakeConfig, RenderConfig, TrainConfig
 from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.encoding.face_grid import NO_TEXELS, build_face_layout, num_texels
@@ -42,6 +41,7 @@ from nimpostor_jax.train.step import RayBatch, make_optimizer
 from nimpostor_jax.types import BakedImpostor, HashTables, NeuralImpostor, TetMesh
 
 FIT_RAYS = 8192  # a call
+FIT_DEVICES = 4  # at most: each has moments as large as the textures
 SYNC_EVERY = 2  # calls that may be under way at once: each has its buffers from the start
 FIT_REFINEMENT = 4.0  # of training's steps: tets are small, and each should get some samples
 LOOK_SHARE, DEPTHS_SHARE = 0.25, 0.5  # of the rays: for what is visible at all, and how deep it lies
@@ -72,13 +72,13 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
     render = fit_config(mesh, pool, probe, with_step(scene.config.render, impostor.config.encoding))
 
-    devices = device_mesh()
+    devices = device_mesh(fit_devices(len(probe.jitter)))
 
     def add_up(start: Callable[[], Any], add: Callable[..., Any], share: float, text: str, *more: Any) -> Any:
         """Sums over rays, on the host; each device adds up its own."""
         compiled = jax.jit(sums_by_device(devices, add), static_argnames="config", donate_argnums=0)
         shared = jax.device_put((impostor, *more), replicated(devices))
-        size = padded_size(len(probe.jitter), devices.size)
+        size = len(probe.jitter)
 
         @partial(jax.jit, out_shardings=over_rays(devices))
         def no_sums() -> Any:
@@ -90,7 +90,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
             sums = compiled(sums, *shared, batch, config=render)
             if i % SYNC_EVERY == 0:
                 jax.block_until_ready(sums)
-        return jax.tree.map(lambda x: np.asarray(x).sum(axis=0), sums)
+        return jax.tree.map(_total, sums)
 
     found = add_up(lambda: jnp.zeros((len(mesh.tets), 2)), add_visible, LOOK_SHARE, "look")
     light, taken = found.T
@@ -124,6 +124,23 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     )
     del contents  # as large as the textures
     return refine(baked, pool, train, render, config, log=log)
+
+
+def fit_devices(num_rays: int) -> list[jax.Device]:
+    """As many of the local devices as divide a call's rays, each of which has sums of its own to keep."""
+    devices = jax.local_devices()
+    count = max(n for n in range(1, min(FIT_DEVICES, len(devices)) + 1) if num_rays % n == 0)
+    return devices[:count]
+
+
+def _total(sums: jax.Array) -> np.ndarray:
+    """The sum over devices of their own ones, which are given up: all of them would not fit twice."""
+    first, *others = (shard.data for shard in sums.addressable_shards)
+    total = np.array(first[0])
+    for other in others:
+        total += np.asarray(other)[0]
+    sums.delete()
+    return total
 
 
 def fine_impostor(impostor: NeuralImpostor, views: PosedImages, config: BakeConfig) -> NeuralImpostor:

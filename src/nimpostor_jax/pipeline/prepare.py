@@ -40,7 +40,7 @@ SMALL_LOOPS = "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_thresho
 
 
 def use_all_cores() -> None:
-    """Give XLA's CPU back end one device a core, over which training and frames are spread.
+    """Give XLA's CPU back end one device a core, over which training, frames and baking are spread.
 
     Loops, gathers and scatters of one device run on one core. Call before any other use of jax; without
     effect on accelerators or where the number of devices has been chosen already. Small loops are compiled as

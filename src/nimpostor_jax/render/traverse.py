@@ -208,7 +208,7 @@ def _march_again(
 
     def march(start: Array, found: Crossings) -> Crossings:
         chosen = take(again, start, tile)
-        # Past the end: the tile's first ray once more, which widens no cone, and nothing is written.
+        # Past the end: the tile's first ray once more, so that its cone stays narrow; nothing is written.
         read = jnp.where(chosen < num_rays, chosen, chosen[0])
         origins, directions = (x[read].T for x in lines)
         holds, count, _ = search_entries(tables, config, True, *_frame(origins, directions))

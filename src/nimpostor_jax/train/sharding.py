@@ -45,7 +45,7 @@ def data_parallel(mesh: Mesh) -> Callable[..., tuple[Parameters, Metrics]]:
 def sums_by_device(mesh: Mesh, add: Callable[..., Any]) -> Callable[..., Any]:
     """`add(sums, *shared, batch, config)`, where each device adds its share of the rays to sums of its own.
 
-    These have a leading axis over devices. Their number must divide that of the rays.
+    These have a leading axis over devices. The number of rays must be a multiple of that of devices.
     """
 
     def add_all(sums: Any, *arguments: Any, config: RenderConfig) -> Any:
@@ -67,5 +67,5 @@ def replicated(mesh: Mesh) -> NamedSharding:
 
 
 def over_rays(mesh: Mesh) -> NamedSharding:
-    """Sharding of batches."""
+    """Sharding of batches, and of what each device has of its own."""
     return NamedSharding(mesh, P(AXIS))
