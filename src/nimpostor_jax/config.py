@@ -320,20 +320,23 @@ class TrainConfig:
 class BakeConfig:
     """Baking onto face textures (Sec. 3.4).
 
-    The cage's tets are first halved until their edges are about `tet_pixels` long in the training views: a
-    texture blurs what lies deep behind its face. After the fit to what single tets show, `refine_steps` of
-    training improve the textures (and with `refine_decoders` the decoders) on whole pictures.
+    The cage's tets are first halved, where something is seen, until their edges are about `tet_pixels` long
+    in the training views: a texture blurs what lies deep behind its face. After the fit to what single tets
+    show, `refine_steps` of training improve the textures (and with `refine_decoders` the decoders) on whole
+    pictures: the training views, and `novel_views` that the impostor renders from between them.
     """
 
-    tet_pixels: float = 20.0
+    tet_pixels: float = 10.0
     texels_per_pixel: float = 0.7  # along an edge, at the training views' distance
+    channels: int = 8  # that a texel keeps of the features, as the colour decoder takes them
     max_resolution: int = 256  # texels along an edge
     min_opacity: float = 2e-3  # of a tet, on average over the light that reaches it; less is left out
     max_megabytes: int = 1024  # of textures; more is refused. Refining them holds several copies
-    fit_rays: int = 2_000_000
-    refine_steps: int = 500
+    fit_rays: int = 1_000_000
+    novel_views: int = 300
+    refine_steps: int = 3000
     refine_decoders: bool = True
-    learning_rate: float = 5e-3
+    learning_rate: float = 2e-2  # falls to a tenth
 
     def __post_init__(self) -> None:
         _require(self.tet_pixels > 0, self, "tet_pixels", "> 0")
@@ -341,7 +344,9 @@ class BakeConfig:
         _require(0 <= self.min_opacity < 1, self, "min_opacity", "in [0, 1)")
         _require(1 <= self.max_resolution <= 4096, self, "max_resolution", "in [1, 4096]")
         _require(self.max_megabytes >= 1, self, "max_megabytes", ">= 1")
+        _require(self.channels >= 1, self, "channels", ">= 1")
         _require(self.fit_rays >= 1, self, "fit_rays", ">= 1")
+        _require(self.novel_views >= 0, self, "novel_views", ">= 0")
         _require(self.refine_steps >= 0, self, "refine_steps", ">= 0")
         _require(self.learning_rate > 0, self, "learning_rate", "> 0")
 

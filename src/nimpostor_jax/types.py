@@ -232,7 +232,8 @@ class BakedImpostor:
 
     mesh: TetMesh
     depths: HashTables  # features [texels, 4]: where on the way through the tet something is seen
-    textures: HashTables  # features [texels, 4 * (1 + C)]: opacity and mean features; same FaceLayout
+    opacities: HashTables  # features [texels, 4], and the same FaceLayout
+    textures: HashTables  # features [texels, 4 * K]: mean features as the decoder takes them; same FaceLayout
     decoders: dict[str, Any]
     decoder_index: Int[Array, " T"]
     config: ImpostorConfig = struct.field(pytree_node=False)

@@ -7,7 +7,14 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from nimpostor_jax.config import DecoderConfig, EncodingConfig, ImpostorConfig
-from nimpostor_jax.field.decoder import decode_appearance, decode_density, init_decoders, truncated_exp
+from nimpostor_jax.field.decoder import (
+    apply_layers,
+    decode_appearance,
+    decode_density,
+    init_decoders,
+    principal_channels,
+    truncated_exp,
+)
 
 CONFIG = ImpostorConfig(
     encoding=EncodingConfig(num_levels=2),
@@ -92,3 +99,26 @@ def test_truncated_exp_and_its_gradient_are_bounded(x):
     assert 0 < gradient <= 1.01 * np.exp(15)
     _, tangent = jax.jvp(truncated_exp, (x,), (1.0,))
     assert tangent == gradient
+
+
+@pytest.mark.parametrize(("rank", "count"), [(2, 2), (4, 4), (4, 9), (4, 2)])
+def test_principal_channels_keep_what_the_decoder_sees(rank, count, inputs, rng):
+    """Exact where there are as many as features vary in; else the best ones."""
+    _, directions, ids = inputs
+    parameters = randomised(init_decoders(jax.random.key(0), CONFIG, num_sets=2), rng)
+    features = jnp.asarray(rng.normal(size=(20, rank)) @ rng.normal(size=(rank, 4)), jnp.float32)
+    products = np.stack([features[ids == i].T @ features[ids == i] for i in range(2)])
+    fewer, layer = principal_channels(parameters, products, count)
+    channels = apply_layers(layer, features, ids)
+    assert channels.shape == (20, min(count, 4))
+    colors = decode_appearance(parameters, features, directions, ids)
+    found = decode_appearance(fewer, channels, directions, ids)
+    if count >= rank:
+        assert_allclose(found, colors, atol=1e-5)  # sums of float32 in another order
+    else:
+        for i in range(2):
+            first, second = (np.asarray(p["appearance"][0]["weight"][i]) for p in (parameters, fewer))
+            seen = np.asarray(features[ids == i]) @ first[:4]
+            kept = np.asarray(channels[ids == i]) @ second[:count]
+            left_out = np.linalg.svd(seen, compute_uv=False)[count:]
+            assert_allclose(np.linalg.norm(seen - kept), np.linalg.norm(left_out), rtol=1e-3)

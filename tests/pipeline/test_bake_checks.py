@@ -1,10 +1,17 @@
-"""pipeline.bake: what is refused before long work."""
+"""pipeline.bake: what is refused before long work, and which tets are left."""
+
+import dataclasses
 
 import numpy as np
 import pytest
+import scenes
+from scenes import constant_density
 
 from nimpostor_jax.config import BakeConfig
-from nimpostor_jax.pipeline.bake import checked_texels, face_pixels
+from nimpostor_jax.edit.subdivide import subdivide
+from nimpostor_jax.pipeline.bake import bake, checked_texels, face_pixels, only_tets
+from nimpostor_jax.pipeline.prepare import prepare
+from nimpostor_jax.render.frame import render_frame
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0, 0]])
 
@@ -31,6 +38,25 @@ def test_textures_that_need_too_much_memory_are_refused():
         checked_texels(resolutions, 14, BakeConfig(max_megabytes=100), print)
 
 
-def test_an_impostor_that_shows_nothing_is_refused():
+def test_an_impostor_that_shows_nothing_is_refused(config, cage):
+    scene = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
     with pytest.raises(ValueError, match="nothing is seen in any tet; train the impostor"):
-        checked_texels(np.zeros((10, 4), int), 64, BakeConfig(), print)
+        bake(constant_density(scene.impostor, -40.0), scene, BakeConfig(fit_rays=1000), log=lambda _: None)
+
+
+def test_what_is_left_of_tets_keeps_its_place_in_the_field():
+    """All tets: the same picture. Some: theirs alone, and the vertices stay."""
+    impostor = subdivide(scenes.impostor("blobs"), 1)
+    camera = scenes.camera(position=(8.0, 6.0, 5.0), target=(-0.9, 0.5, 0.8))
+    march = dataclasses.replace(scenes.RENDER.march, max_tets_per_ray=64, max_entries_per_ray=8)
+    config = dataclasses.replace(scenes.RENDER, march=march)
+    keep = np.ones(len(impostor.mesh.tets), bool)
+    whole = render_frame(impostor, camera, config)
+    np.testing.assert_allclose(render_frame(only_tets(impostor, keep), camera, config).color, whole.color)
+    keep[::2] = False
+    part = only_tets(impostor, keep)
+    np.testing.assert_array_equal(part.mesh.vertices, impostor.mesh.vertices)
+    np.testing.assert_array_equal(part.mesh.tets, np.asarray(impostor.mesh.tets)[keep])
+    np.testing.assert_array_equal(part.embedding.cells, np.asarray(impostor.embedding.cells)[keep])
+    left = render_frame(part, camera, config)
+    assert 0.1 < left.opacity.sum() / whole.opacity.sum() < 0.9

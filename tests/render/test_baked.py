@@ -54,14 +54,12 @@ def texel_lookup(tables, tet, place, leave):
 
 
 def tet_lookup(baked, tet, enter, leave):
-    """What one ray sees in one tet: opacity, share of the way, features times opacity."""
-    if int(baked.textures.layout.resolutions[tet, 0]) == 0:
-        return 0.0, 0.5, np.zeros(baked.config.encoding.feature_dim)
+    """What one ray sees in one tet: opacity, share of the way, channels times opacity."""
     (share,) = texel_lookup(baked.depths, tet, enter, leave)
     point = enter + share * (leave - enter)
     point[int(np.argmin(enter))] = 0
-    opacity, *features = texel_lookup(baked.textures, tet, point / point.sum(), leave)
-    return opacity, share, opacity * np.array(features)
+    (opacity,) = texel_lookup(baked.opacities, tet, point / point.sum(), leave)
+    return opacity, share, opacity * texel_lookup(baked.textures, tet, point / point.sum(), leave)
 
 
 def mlp(layers, x):
@@ -70,8 +68,20 @@ def mlp(layers, x):
     return x @ np.asarray(layers[-1]["weight"][0]) + np.asarray(layers[-1]["bias"][0])
 
 
-def test_agrees_with_a_loop_over_tets(x64):
+def pushed_together(baked):
+    """The second cloud moved into the first."""
+    vertices = np.asarray(baked.mesh.vertices)
+    second = np.arange(len(vertices)) >= len(vertices) // 2
+    shift = 0.9 * (vertices[second].mean(axis=0) - vertices[~second].mean(axis=0))
+    moved = jnp.asarray(np.where(second[:, None], vertices - shift, vertices))
+    return baked.replace(mesh=baked.mesh.replace(vertices=moved))
+
+
+@pytest.mark.parametrize("overlapping", [False, True])
+def test_agrees_with_a_loop_over_tets(overlapping, x64):
+    """Where tets overlap, what is seen first comes first."""
     baked = baked_scene(dtype="float64", opacity=(0.05, 0.95))
+    baked = pushed_together(baked) if overlapping else baked
     rays = rays_at(baked)
     output = render(baked, rays, CONFIG)
     vertices, tets = local_vertices(baked.mesh)
@@ -79,13 +89,16 @@ def test_agrees_with_a_loop_over_tets(x64):
     for ray in range(COUNT):
         origin = (np.asarray(rays.origins[ray]) - center) / scale
         light, sums, depth, opacity = 1.0, 0.0, 0.0, 0.0
+        looked_up = []
         for low, high, tet, enter, leave in oracles.ray_segments(
             vertices, tets, origin, np.asarray(rays.directions[ray])
         ):
             seen, share, features = tet_lookup(baked, tet, enter, leave)
+            looked_up.append((low + share * (high - low), seen, features))
+        for t, seen, features in sorted(looked_up, key=lambda part: part[0]):
             sums = sums + light * features
             opacity += light * seen
-            depth += light * seen * (low + share * (high - low))
+            depth += light * seen * t
             light *= 1 - seen
         view = np.asarray(spherical_harmonics(rays.directions[ray], baked.config.decoder.sh_degree))
         color = 1 / (1 + np.exp(-mlp(baked.decoders["appearance"], np.append(sums / opacity, view))))
@@ -103,7 +116,7 @@ def test_rays_that_miss_are_exactly_transparent():
         assert_array_equal(value, np.zeros_like(value))
 
 
-@pytest.mark.parametrize("which", ["depths", "textures", "vertices"])
+@pytest.mark.parametrize("which", ["depths", "opacities", "textures", "vertices"])
 def test_gradients_agree_with_differences(which, x64, rng):
     """In texels everywhere; in vertices and depths while points stay in their texels."""
     baked = baked_scene("cube", "float64", opacity=(0.2, 0.6))
@@ -159,6 +172,7 @@ def test_the_order_of_tets_does_not_matter(frames):
     shuffled = baked.replace(
         mesh=TetMesh(**{**mesh.__dict__, "tets": mesh.tets[order], "object_ids": mesh.object_ids[order]}),
         depths=baked.depths.replace(layout=moved),
+        opacities=baked.opacities.replace(layout=moved),
         textures=baked.textures.replace(layout=moved),
     )
     again = rasterize_frame(shuffled, camera, config)

@@ -24,14 +24,16 @@ def walk(mesh, rays):
     return by_ray(locate_segments(mesh, rays, traverse(march_tables(mesh), rays, CONFIG)))
 
 
+@pytest.mark.parametrize(("culled", "flagged"), [(0, 0), (12, 1 << 13)], ids=["rays", "tiles and rays"])
 @pytest.mark.parametrize("name", ["nonconvex", "blobs"])
-def test_a_tree_finds_the_entries_that_a_tile_finds(name, rng, monkeypatch):
+def test_a_tree_finds_the_entries_that_a_tile_finds(name, culled, flagged, rng, monkeypatch):
     mesh = tet_mesh(name)
     kinds = [make(*local_vertices(mesh), rng, COUNT) for make in (GENERIC | DEGENERATE).values()]
     rays = as_rays(tuple(np.concatenate(parts) for parts in zip(*kinds, strict=True)))
     expected = jax.jit(traverse, static_argnums=2)(march_tables(mesh), rays, CONFIG)
-    monkeypatch.setattr(entries, "MAX_CULLED", 0)
-    jax.clear_caches()  # the limit is read while tracing
+    monkeypatch.setattr(entries, "MAX_CULLED", culled)
+    monkeypatch.setattr(entries, "MAX_FLAGGED", flagged)
+    jax.clear_caches()  # the limits are read while tracing
     found = jax.jit(traverse, static_argnums=2)(march_tables(mesh), rays, CONFIG)
     jax.clear_caches()
     assert_array_equal(found.codes, expected.codes)

@@ -19,7 +19,6 @@ from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.types import FaceLayout
 
 ONE_LEVEL = EncodingConfig(num_levels=1)
-NO_TEXELS = 3  # the first, which are read for tets without textures
 
 
 def num_texels(resolutions: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batch"]:
@@ -28,11 +27,10 @@ def num_texels(resolutions: Int[np.ndarray, "*batch"]) -> Int[np.ndarray, "*batc
 
 
 def build_face_layout(resolutions: Int[np.ndarray, "T 4"]) -> FaceLayout:
-    """The layout for given resolutions; tets with resolutions 0 share `NO_TEXELS`. Host code."""
+    """The layout for given resolutions, all at least 1. Host code."""
     resolutions = np.asarray(resolutions, np.int64)
-    counts = np.where(resolutions > 0, num_texels(resolutions), 0).reshape(-1)
-    starts = NO_TEXELS + np.cumsum(counts) - counts
-    starts = np.where(resolutions > 0, starts.reshape(resolutions.shape), 0)
+    counts = num_texels(resolutions).reshape(-1)
+    starts = (np.cumsum(counts) - counts).reshape(resolutions.shape)
     return FaceLayout(
         starts=jnp.asarray(starts, jnp.int32), resolutions=jnp.asarray(resolutions, jnp.int32)
     )

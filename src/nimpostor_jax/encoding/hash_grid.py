@@ -96,6 +96,8 @@ def _encode(
     shape = (config.num_levels, tet_ids.shape[0], features.shape[1])
     zeros = jnp.zeros(shape, jnp.result_type(features, lambdas))
     by_level = _for_levels(config, grid, first_level, add_level, zeros)
+    if config.num_levels == 1:
+        return by_level[0]
 
     def join_chunk(start: Array, out: Array) -> Array:
         part = jax.lax.dynamic_slice_in_dim(by_level, start, chunk, axis=1)

@@ -54,7 +54,7 @@ def init_decoders(key: Array, config: ImpostorConfig, num_sets: int = 1) -> Para
 
 def num_decoder_sets(parameters: Parameters) -> int:
     """D."""
-    return parameters["density"][0]["weight"].shape[0]
+    return parameters["appearance"][0]["weight"].shape[0]
 
 
 def reorder_features(parameters: Parameters, order: Int[np.ndarray, " C"]) -> Parameters:
@@ -72,7 +72,7 @@ def decode_density(
     parameters: Parameters, features: Float[Array, "M C"], decoder_ids: Int[Array, " M"]
 ) -> Float[Array, " M"]:
     """Density D_sigma(f_p) >= 0 per unit of the density measure (Eq. 7)."""
-    return truncated_exp(_apply(parameters["density"], features, decoder_ids)[..., 0])
+    return truncated_exp(apply_layers(parameters["density"], features, decoder_ids)[..., 0])
 
 
 def decode_appearance(
@@ -83,10 +83,35 @@ def decode_appearance(
 ) -> Float[Array, "M 3"]:
     """Colour D_r(f_p + f_d) in [0, 1] (Eq. 7)."""
     inputs = jnp.concatenate([features, direction_features], axis=-1)
-    return jax.nn.sigmoid(_apply(parameters["appearance"], inputs, decoder_ids))
+    return jax.nn.sigmoid(apply_layers(parameters["appearance"], inputs, decoder_ids))
 
 
-def _apply(layers: list, inputs: Float[Array, "M C"], decoder_ids: Int[Array, " M"]) -> Float[Array, "M out"]:
+def principal_channels(
+    parameters: Parameters, products: Float[np.ndarray, "D C C"], count: int
+) -> tuple[Parameters, list]:
+    """Appearance decoders of `count` channels (at most) instead of C features; the layer that makes them.
+
+    The first layer is linear: of features f it sees f W, and nearly all of that lies in the principal
+    directions V over the features' second moments `products`, f W = (f W V) V^T. Host code.
+    """
+    first, *others = parameters["appearance"]
+    size, weights = products.shape[1], np.asarray(first["weight"], np.float64)
+    count = min(count, size, weights.shape[2])
+    makers, takers = [], []
+    for weight, moment in zip(weights, np.asarray(products, np.float64), strict=True):
+        seen = weight[:size]
+        directions = np.linalg.eigh(seen.T @ moment @ seen)[1][:, ::-1][:, :count]
+        makers.append(seen @ directions)
+        takers.append(np.concatenate([directions.T, weight[size:]]))
+    dtype = first["weight"].dtype
+    maker = {"weight": jnp.asarray(np.stack(makers), dtype), "bias": jnp.zeros((len(makers), count), dtype)}
+    return {"appearance": [first | {"weight": jnp.asarray(np.stack(takers), dtype)}, *others]}, [maker]
+
+
+def apply_layers(
+    layers: list, inputs: Float[Array, "M C"], decoder_ids: Int[Array, " M"]
+) -> Float[Array, "M out"]:
+    """An MLP with ReLU between its layers, of each point's own decoder set."""
     num_sets = layers[0]["weight"].shape[0]
     if num_sets == 1:
         return _mlp(layers, 0, inputs)

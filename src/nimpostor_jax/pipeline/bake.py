@@ -9,15 +9,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jax.sharding import Mesh
+from jaxtyping import Bool, Float, Int
 from tqdm.auto import tqdm
 
 from nimpostor_jax.config import BakeConfig, RenderConfig, TrainConfig
 from nimpostor_jax.edit.subdivide import subdivide
-from nimpostor_jax.encoding.face_grid import NO_TEXELS, build_face_layout, num_texels
+from nimpostor_jax.encoding.face_grid import build_face_layout, num_texels
+from nimpostor_jax.field.decoder import principal_channels
 from nimpostor_jax.geometry.tetrahedron import FACES
-from nimpostor_jax.geometry.topology import world_vertices
+from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
 from nimpostor_jax.io.blender import PosedImages
+from nimpostor_jax.pipeline.novel_views import with_novel_views
 from nimpostor_jax.pipeline.prepare import Log, Scene
 from nimpostor_jax.render.baked import BASIS
 from nimpostor_jax.render.capacity import fit_capacities
@@ -26,104 +29,120 @@ from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.bake import (
     Moments,
+    Seen,
     add_contents,
     add_depths,
-    add_visible,
-    baked_parameters,
+    add_seen,
+    init_refinement,
     no_moments,
+    nothing_seen,
     refine_step,
     solve_moments,
     with_baked_parameters,
 )
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
 from nimpostor_jax.train.sharding import device_mesh, over_rays, replicated, sums_by_device
-from nimpostor_jax.train.step import RayBatch, make_optimizer
-from nimpostor_jax.types import BakedImpostor, HashTables, NeuralImpostor, TetMesh
+from nimpostor_jax.train.step import RayBatch
+from nimpostor_jax.types import BakedImpostor, Embedding, HashTables, NeuralImpostor, TetMesh
 
 FIT_RAYS = 8192  # a call
 FIT_DEVICES = 4  # at most: each has moments as large as the textures
 SYNC_EVERY = 2  # calls that may be under way at once: each has its buffers from the start
-FIT_REFINEMENT = 4.0  # of training's steps: tets are small, and each should get some samples
-LOOK_SHARE, DEPTHS_SHARE = 0.25, 0.5  # of the rays: for what is visible at all, and how deep it lies
+FIT_REFINEMENT = 2.0  # of training's steps: tets are small, and each should get some samples
+LOOK_VIEWS, LOOK_RAYS = 32, 250_000  # to find out what is visible at all
+DEPTHS_SHARE = 0.5  # of the rays: for how deep in the tets something lies
 FINAL_RATE = 0.1  # of the learning rate, at the end of the refinement
-RATES = {"depths": 1.0, "textures": 1.0, "decoders": 0.2}  # shares of it
+DECODER_SHARE = 0.2  # of it
 
 
 def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log = print) -> BakedImpostor:
     """The impostor with what its tets show baked onto their faces; best trained with early integration.
 
-    Halves the cage's tets, leaves out those in which nothing is seen, fits textures to what training rays
-    gather in each of the others, and refines them on the training views. Raises ValueError where the textures
-    would need more than `max_megabytes`, or faces have no area.
+    Halves the tets in which something is seen, leaves out the others, fits textures to what rays gather, and
+    refines them on whole pictures: the training views, and what the impostor shows from between them. Raises
+    ValueError where the textures would need more than `max_megabytes`, or faces have no area.
     """
     if impostor.gates or impostor.paints:
         raise ValueError("consolidate live operations (gates, paints) before the impostor is baked")
-    impostor = fine_impostor(impostor, scene.train, config)
-    train, mesh = scene.config.train, impostor.mesh
+    train = scene.config.train
+    render = with_step(scene.config.render, impostor.config.encoding)
+    part, seen = visible_part(impostor, scene.train, render, config, log=log)
+    mesh = part.mesh
     pixels = face_pixels(world_vertices(mesh), np.asarray(mesh.tets), scene.train)
-    pool, _ = build_pool(
-        mesh,
-        scene.train.cameras,
-        scene.train.images,
-        scene.config.render.march,
-        scene.train.backgrounds,
-    )
-    key = jax.random.key(train.seed + 2)
-    probe = draw_batch(key, 0, pool, min(FIT_RAYS, config.fit_rays), "white")
-    render = fit_config(mesh, pool, probe, with_step(scene.config.render, impostor.config.encoding))
-
-    devices = device_mesh(fit_devices(len(probe.jitter)))
-
-    def add_up(start: Callable[[], Any], add: Callable[..., Any], share: float, text: str, *more: Any) -> Any:
-        """Sums over rays, on the host; each device adds up its own."""
-        compiled = jax.jit(sums_by_device(devices, add), static_argnames="config", donate_argnums=0)
-        shared = jax.device_put((impostor, *more), replicated(devices))
-        size = len(probe.jitter)
-
-        @partial(jax.jit, out_shardings=over_rays(devices))
-        def no_sums() -> Any:
-            return jax.tree.map(lambda x: jnp.broadcast_to(x, (devices.size, *x.shape)), start())
-
-        sums, count = no_sums(), -(-round(share * config.fit_rays) // size)
-        for i in tqdm(range(count), desc=text, unit="batch", disable=None):
-            batch = jax.device_put(draw_batch(key, i, pool, size, "white"), over_rays(devices))
-            sums = compiled(sums, *shared, batch, config=render)
-            if i % SYNC_EVERY == 0:
-                jax.block_until_ready(sums)
-        return jax.tree.map(_total, sums)
-
-    found = add_up(lambda: jnp.zeros((len(mesh.tets), 2)), add_visible, LOOK_SHARE, "look")
-    light, taken = found.T
-    shown = taken > config.min_opacity * np.maximum(light, 1)
-    resolutions = np.clip(np.ceil(config.texels_per_pixel * pixels), 1, config.max_resolution)
-    resolutions = np.where(shown[:, None], resolutions, 0).astype(np.int64)
-    num_features = impostor.config.encoding.feature_dim
-    counts = checked_texels(resolutions, BASIS * (2 + num_features), config, log)
-    faces = np.concatenate([np.zeros(NO_TEXELS, int), np.repeat(np.arange(counts.size), counts)])
+    resolutions = np.ceil(config.texels_per_pixel * pixels).astype(np.int64)
+    resolutions = np.clip(resolutions, 1, config.max_resolution)
+    decoders, layers = principal_channels(impostor.decoders, np.asarray(seen.products), config.channels)
+    num_channels = layers[0]["weight"].shape[2]
+    counts = checked_texels(resolutions, BASIS * (2 + num_channels), config, log)
+    faces = np.repeat(np.arange(counts.size), counts)
     layout = build_face_layout(resolutions)
+    views = with_novel_views(scene.train, impostor, config.novel_views, scene.config.render, train.seed)
+    rays = TrainingRays.of(mesh, views, render, config.fit_rays, train.seed + 2)
 
-    def tables(*moments: Moments) -> HashTables:
-        texels = np.concatenate([solve_moments(part, faces) for part in moments], axis=2)
+    def moments(num: int) -> Moments:
+        return no_moments(len(faces), num)
+
+    def table(found: Moments) -> HashTables:
+        texels = solve_moments(found, faces)
         return HashTables(features=jnp.asarray(texels.reshape(len(faces), -1)), layout=layout)
 
-    def no_contents() -> tuple[Moments, Moments]:
-        return no_moments(len(faces), 1), no_moments(len(faces), num_features)
-
-    depths = tables(add_up(partial(no_moments, len(faces), 1), add_depths, DEPTHS_SHARE, "depths", layout))
-    contents = add_up(no_contents, add_contents, 1.0, "contents", depths)
-    decoder_index = impostor.decoder_index
-    if impostor.embedding is not None:
-        decoder_index = decoder_index[impostor.embedding.cells]
+    depths = rays.add_up(partial(moments, 1), add_depths, DEPTHS_SHARE, "depths", part, layout)
+    depths = table(depths)
+    contents = rays.add_up(
+        lambda: (moments(1), moments(num_channels)), add_contents, 1.0, "contents", part, layers, depths
+    )
     baked = BakedImpostor(
         mesh=mesh,
         depths=depths,
-        textures=tables(*contents),
-        decoders=impostor.decoders,
-        decoder_index=decoder_index,
+        opacities=table(contents[0]),
+        textures=table(contents[1]),
+        decoders=decoders,
+        decoder_index=part.decoder_index[part.embedding.cells],  # type: ignore[union-attr]
         config=impostor.config,
     )
     del contents  # as large as the textures
-    return refine(baked, pool, train, render, config, log=log)
+    return refine(baked, rays.pool, train, rays.config, config, log=log)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingRays:
+    """Batches of views' rays through a mesh, and sums over them."""
+
+    pool: PixelPool
+    key: jax.Array
+    count: int
+    size: int  # of a batch
+    config: RenderConfig  # with steps and buffers for the mesh
+    devices: Mesh
+
+    @staticmethod
+    def of(mesh: TetMesh, views: PosedImages, config: RenderConfig, count: int, seed: int) -> "TrainingRays":
+        """`count` rays of the views' pixels, all that `add_up` has to draw from."""
+        pool, _ = build_pool(mesh, views.cameras, views.images, config.march, views.backgrounds)
+        key, size = jax.random.key(seed), min(FIT_RAYS, count)
+        sized = fit_config(mesh, pool, draw_batch(key, 0, pool, size, "white"), config)
+        return TrainingRays(pool, key, count, size, sized, device_mesh(fit_devices(size)))
+
+    def add_up(
+        self, start: Callable[[], Any], add: Callable[..., Any], share: float, text: str, *shared: Any
+    ) -> Any:
+        """`add`'s sums over a share of the rays, on the host; each device adds up its own."""
+        compiled = jax.jit(sums_by_device(self.devices, add), static_argnames="config", donate_argnums=0)
+        shared = jax.device_put(shared, replicated(self.devices))
+
+        @partial(jax.jit, out_shardings=over_rays(self.devices))
+        def no_sums() -> Any:
+            return jax.tree.map(lambda x: jnp.broadcast_to(x, (self.devices.size, *x.shape)), start())
+
+        sums, count = no_sums(), -(-round(share * self.count) // self.size)
+        for i in tqdm(range(count), desc=text, unit="batch", disable=None):
+            batch = jax.device_put(
+                draw_batch(self.key, i, self.pool, self.size, "white"), over_rays(self.devices)
+            )
+            sums = compiled(sums, *shared, batch, config=self.config)
+            if i % SYNC_EVERY == 0:
+                jax.block_until_ready(sums)
+        return jax.tree.map(_total, sums)
 
 
 def fit_devices(num_rays: int) -> list[jax.Device]:
@@ -143,11 +162,47 @@ def _total(sums: jax.Array) -> np.ndarray:
     return total
 
 
-def fine_impostor(impostor: NeuralImpostor, views: PosedImages, config: BakeConfig) -> NeuralImpostor:
-    """The impostor with its tets halved until their faces' edges are about `tet_pixels` long in the views."""
+def visible_part(
+    impostor: NeuralImpostor,
+    views: PosedImages,
+    render: RenderConfig,
+    config: BakeConfig,
+    *,
+    log: Log = print,
+) -> tuple[NeuralImpostor, Seen]:
+    """The tets in which something is seen, halved until edges are about `tet_pixels` long; and what is seen.
+
+    Rays do not cross the other tets, whose vertices are kept. Raises ValueError where nothing is seen.
+    """
+    some = views.select(np.linspace(0, len(views) - 1, min(LOOK_VIEWS, len(views))).round().astype(int))
+    vertices, tets = world_vertices(impostor.mesh), np.asarray(impostor.mesh.tets)
+    longest = np.median(face_pixels(vertices, tets, views))
+    halvings = max(0, math.ceil(math.log2(longest / config.tet_pixels)))
+    for i in range(halvings + 1):
+        rays = TrainingRays.of(impostor.mesh, some, render, min(LOOK_RAYS, config.fit_rays), i)
+        seen = rays.add_up(partial(nothing_seen, impostor), add_seen, 1.0, "look", impostor)
+        visible = np.asarray(seen.taken > config.min_opacity * np.maximum(seen.light, 1))
+        log(f"something is seen in {visible.sum():,} of {len(visible):,} tets")
+        if not visible.any():
+            raise ValueError("nothing is seen in any tet; train the impostor before it is baked")
+        if i < halvings:
+            impostor = subdivide(impostor, 1, visible)
+    return only_tets(impostor, visible), seen
+
+
+def only_tets(impostor: NeuralImpostor, keep: Bool[np.ndarray, " T"]) -> NeuralImpostor:
+    """The impostor without the other tets of its mesh. Its vertices and its field stay."""
     mesh = impostor.mesh
-    longest = np.median(face_pixels(world_vertices(mesh), np.asarray(mesh.tets), views))
-    return subdivide(impostor, max(0, math.ceil(math.log2(longest / config.tet_pixels))))
+    vertices, tets = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.tets)
+    cells, lambdas = np.arange(len(tets)), np.broadcast_to(np.eye(4), (len(tets), 4, 4))
+    if impostor.embedding is not None:
+        cells, lambdas = np.asarray(impostor.embedding.cells), np.asarray(impostor.embedding.lambdas)
+    within = Embedding(
+        cells=jnp.asarray(cells[keep], jnp.int32), lambdas=jnp.asarray(lambdas[keep], mesh.vertices.dtype)
+    )
+    objects = np.asarray(mesh.object_ids)[keep]
+    part = build_in_frame(mesh, vertices, tets[keep], objects, deformed=True)
+    return dataclasses.replace(impostor, mesh=part, embedding=within)
 
 
 def fit_config(mesh: TetMesh, pool: PixelPool, probe: RayBatch, config: RenderConfig) -> RenderConfig:
@@ -162,19 +217,17 @@ def checked_texels(
     resolutions: Int[np.ndarray, "U 4"], numbers: int, config: BakeConfig, log: Log
 ) -> Int[np.ndarray, " 4U"]:
     """Texels of each face. Raises ValueError where all, of so many numbers each, need too much memory."""
-    counts = np.where(resolutions > 0, num_texels(resolutions), 0).reshape(-1)
+    counts = num_texels(resolutions).reshape(-1)
     megabytes = counts.sum() * numbers * 4 / 1e6
     log(
-        f"{len(resolutions):,} tets, {np.sum(resolutions[:, 0] > 0):,} with textures of at most "
-        f"{resolutions.max()} texels along an edge; {counts.sum():,} texels: {megabytes:.0f} MB"
+        f"{len(resolutions):,} tets with textures of at most {resolutions.max()} texels along an edge; "
+        f"{counts.sum():,} texels: {megabytes:.0f} MB"
     )
     if megabytes > config.max_megabytes:
         raise ValueError(
             f"the textures need {megabytes:.0f} MB, more than BakeConfig.max_megabytes = "
             f"{config.max_megabytes}; lower BakeConfig.texels_per_pixel or raise the limit"
         )
-    if not counts.sum():
-        raise ValueError("nothing is seen in any tet; train the impostor before it is baked")
     return counts
 
 
@@ -190,23 +243,20 @@ def refine(
     """Textures, and decoders where asked, after some steps of training on whole pixels."""
     if not config.refine_steps:
         return baked
-    optimizer = make_optimizer()
-    rates = RATES if config.refine_decoders else RATES | {"decoders": 0.0}
-    step = partial(refine_step, config=render, optimizer=optimizer, share=rates.__getitem__)
-    compiled = jax.jit(step, donate_argnums=(0, 1))
-    parameters = jax.tree.map(jnp.copy, baked_parameters(baked))  # steps consume them
-    state = optimizer.init(parameters)
+    compiled = jax.jit(partial(refine_step, config=render), donate_argnums=0)
+    state = init_refinement(baked)
     key, losses = jax.random.key(train.seed + 3), []
     for i in tqdm(range(config.refine_steps), desc="refine", unit="step", disable=None):
         batch = draw_batch(key, i, pool, train.rays_per_batch, "random")
         rate = config.learning_rate * FINAL_RATE ** (i / config.refine_steps)
-        parameters, state, loss = compiled(parameters, state, baked, batch, jnp.float32(rate))
+        decoder_rate = DECODER_SHARE * rate if config.refine_decoders else 0.0
+        state, loss = compiled(state, baked, batch, jnp.float32(rate), jnp.float32(decoder_rate))
         losses.append(loss)
         if i % SYNC_EVERY == 0:
             jax.block_until_ready(loss)
     first, last = (np.mean([float(x) for x in part]) for part in (losses[:20], losses[-20:]))
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
-    return with_baked_parameters(baked, parameters)
+    return with_baked_parameters(baked, state.parameters)
 
 
 def face_pixels(

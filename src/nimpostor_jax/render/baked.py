@@ -1,24 +1,27 @@
-"""Rendering baked impostors: two texture lookups a crossed tet, one decoded colour a ray (Sec. 3.4, Eq. 10).
+"""Rendering baked impostors: textures of the tets that a ray crosses, one decoded colour (Sec. 3.4, Eq. 10).
 
 The first lookup, where the ray enters the tet, says how deep in the tet something is seen. That point, moved
-to the face from the corner opposite, is where the second looks up what is seen: opacity and mean features.
+to the face from the corner opposite, is where the others look up what is seen: opacity, and mean features.
 Without the first, what lies behind the face would be smeared over the directions from which it is seen.
 Opacity, not optical depth: least squares fits it, and it has a bound where things are solid.
 
-Axes: R rays, N packed segments, C features.
+Axes: R rays, N packed segments, K channels.
 """
 
+import dataclasses
+
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import map_used, packed_indices
+from nimpostor_jax.chunks import map_used, pack_where
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.encoding.face_grid import ONE_LEVEL, face_of
 from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.field.decoder import num_decoder_sets
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.composite import sum_by_ray, transmittance
+from nimpostor_jax.render.composite import sample_weights, sum_by_ray
 from nimpostor_jax.render.renderer import decode_integrated, ray_output
 from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.render.traverse import Entries, MarchTables
@@ -37,84 +40,102 @@ def render_baked_rays(
 ) -> RenderOutput:
     """Colour, opacity and depth of rays [R] given in world space, as `renderer.render_rays`.
 
-    Marches from tet to tet; of the config only the march's sizes and `near` matter, since nothing is sampled.
-    Textures know tets from outside only: one in which a ray starts is looked up as if the ray had entered it
-    by the nearest face. Differentiable in textures, decoders, vertices and rays.
+    Marches from tet to tet; of the config only the march's sizes, `near` and `min_weight` matter, since
+    nothing is sampled. Textures know tets from outside only: one in which a ray starts is looked up as if the
+    ray had entered it by the nearest face. Differentiable in textures, decoders, vertices and rays.
     """
     local = to_local(baked.mesh, rays)
-    return shade_segments(baked, local, march_segments(baked.mesh, local, config, tables, entries))
+    return shade_segments(baked, local, march_segments(baked.mesh, local, config, tables, entries), config)
 
 
-def shade_segments(baked: BakedImpostor, rays: Rays, segments: TetSegments) -> RenderOutput:
-    """Look up, composite and decode the tets that rays [R], in the mesh's own frame, cross in order."""
-    segments, num_used = textured_segments(baked, segments)
-    channels = tet_channels(baked, segments, num_used)
-    light = transmittance(-jnp.log1p(-channels[:, -2]), segments.rays, num_used)
+def shade_segments(
+    baked: BakedImpostor, rays: Rays, segments: TetSegments, config: RenderConfig
+) -> RenderOutput:
+    """Look up, composite and decode the tets that rays [R], in the mesh's own frame, cross.
+
+    Opacities come first, and what is seen only where it contributes `min_weight` or more of a ray's light.
+    Where tets overlap, what is seen first comes first.
+    """
+    used = segments.tet_ids >= 0  # the last used slot ends what is looked at, and few before it are empty
+    num_used = jnp.max(jnp.where(used, jnp.arange(1, used.size + 1, dtype=jnp.int32), 0), initial=0)
+    segments = dataclasses.replace(segments, tet_ids=jnp.maximum(segments.tet_ids, 0))
+    places, t = places_seen(baked.depths, segments, num_used)
+    opacity = jnp.where(used, opacities_at(baked.opacities, segments, places, num_used), 0)
+    order = _along_rays(segments, jax.lax.stop_gradient(t), num_used)
+    optical_depth = -jnp.log1p(-opacity[order])
+    weights = sample_weights(optical_depth, segments.rays, num_used)
+    visible, num_visible = pack_where(_at_least, config.min_weight, jax.lax.stop_gradient(weights), num_used)
+    columns = (segments.tet_ids, segments.rays, segments.lambda_exit, places, t)
+    seen, weights = map_used(_rows, (order, weights), visible, num_visible)
+    tet_ids, owners, lambda_exit, places, t = map_used(_rows, columns, seen, num_visible)
+    texels = encode(baked.textures, ONE_LEVEL, tet_ids, places, num_visible)
+    channels = map_used(_channels, (), (texels, lambda_exit, t), num_visible)
+
     num_rays, num_sets = rays.origins.shape[0], num_decoder_sets(baked.decoders)
-    rows = baked.decoder_index[segments.tet_ids] * num_rays + segments.rays
-    sums = sum_by_ray(light, channels, rows, num_rays * num_sets, num_used)
+    rows = baked.decoder_index[tet_ids] * num_rays + owners
+    sums = sum_by_ray(weights, channels, rows, num_rays * num_sets, num_visible)
     directions = spherical_harmonics(rays.directions, baked.config.decoder.sh_degree)
     sums = decode_integrated(baked.decoders, sums, jnp.tile(directions, (num_sets, 1)))
     return ray_output(sums, baked.mesh.scale, segments.overflow, jnp.zeros_like(segments.overflow))
 
 
-def textured_segments(
-    baked: BakedImpostor, segments: TetSegments
-) -> tuple[TetSegments, Int[Array, ""]]:
-    """Those of the segments that lie in tets with textures, at the front, and how many."""
-    tet_ids = jnp.maximum(segments.tet_ids, 0)
-    keep = (segments.tet_ids >= 0) & has_textures(baked)[tet_ids]
-    chosen, count = packed_indices(keep)
-    names = ("t_enter", "t_exit", "lambda_enter", "lambda_exit")
-    columns = {name: getattr(segments, name) for name in names} | {"tet_ids": tet_ids}
-    packed = {name: column[chosen] for name, column in columns.items()}
-    # Ascending in what no slot holds, too: sums along rays ask for that.
-    rays = jnp.where(jnp.arange(chosen.size) < count, segments.rays[chosen], segments.overflow.shape[0] - 1)
-    return segments.replace(rays=rays, **packed), count  # type: ignore[attr-defined]
+def _along_rays(
+    segments: TetSegments, t: Float[Array, " N"], num_used: Int[Array, ""]
+) -> Int[Array, " N"]:
+    """The segments in the order of what is seen in them: their own, but where tets overlap."""
+    order = jnp.arange(t.size, dtype=jnp.int32)
+
+    def sort() -> Int[Array, " N"]:
+        rays = jnp.where(order < num_used, segments.rays, jnp.iinfo(segments.rays.dtype).max)
+        return jax.lax.sort((rays, t, order), num_keys=2)[2]
+
+    return jax.lax.cond(jnp.any(segments.disordered), sort, lambda: order)
 
 
-def tet_channels(
-    baked: BakedImpostor, segments: TetSegments, num_used: Int[Array, ""]
-) -> Float[Array, "N C+2"]:
-    """What each ray gathers in each tet: features, 1 and t, times the tet's opacity."""
-    share = seen_at(baked.depths, segments, num_used)
-    items = (segments.lambda_enter, segments.lambda_exit, share)
-    places = map_used(seen_on_face, (), items, num_used)
-    texels = encode(baked.textures, ONE_LEVEL, segments.tet_ids, places, num_used)
-    t = segments.t_enter + share * (segments.t_exit - segments.t_enter)
-    return map_used(_channels, (), (texels, segments.lambda_exit, t), num_used)
+def _at_least(least: Float[Array, ""] | float, weights: Float[Array, " chunk"]) -> Bool[Array, " chunk"]:
+    return weights >= least
 
 
-def seen_at(depths: HashTables, segments: TetSegments, num_used: Int[Array, ""]) -> Float[Array, " N"]:
-    """The share of each segment, in [0, 1], at which something is seen, by the textures of depths."""
-    tet_ids = jnp.maximum(segments.tet_ids, 0)
-    texels = encode(depths, ONE_LEVEL, tet_ids, segments.lambda_enter, num_used)
-    return map_used(_share, (), (texels, segments.lambda_exit), num_used)
+def _rows(columns: tuple, indices: Int[Array, " chunk"]) -> tuple:
+    return tuple(column[indices] for column in columns)
 
 
-def _share(_: tuple, part: tuple) -> Float[Array, " chunk"]:
-    return jnp.clip(in_basis(*part)[:, 0], 0, 1)
+def places_seen(
+    depths: HashTables, segments: TetSegments, num_used: Int[Array, ""]
+) -> tuple[Float[Array, "N 4"], Float[Array, " N"]]:
+    """Where each ray sees something in each tet: the point on the face of entry to look it up at, and t."""
+    texels = encode(depths, ONE_LEVEL, segments.tet_ids, segments.lambda_enter, num_used)
+    items = (texels, segments.lambda_enter, segments.lambda_exit, segments.t_enter, segments.t_exit)
+    return map_used(_place_seen, (), items, num_used)
 
 
-def seen_on_face(_: tuple, part: tuple) -> Float[Array, "chunk 4"]:
+def _place_seen(_: tuple, part: tuple) -> tuple[Float[Array, "chunk 4"], Float[Array, " chunk"]]:
     """The point at a share of a segment, moved to the face of entry from the corner opposite."""
-    lambda_enter, lambda_exit, share = part
+    texels, lambda_enter, lambda_exit, t_enter, t_exit = part
+    share = jnp.clip(in_basis(texels, lambda_exit)[:, 0], 0, 1)
     point = lambda_enter + share[:, None] * (lambda_exit - lambda_enter)
     opposite = jnp.arange(4) == face_of(lambda_enter)[:, None]
     on_face = jnp.where(opposite, 0, point)
-    return on_face / jnp.maximum(jnp.sum(on_face, axis=1, keepdims=True), 1e-3)
+    on_face /= jnp.maximum(jnp.sum(on_face, axis=1, keepdims=True), 1e-3)
+    return on_face, t_enter + share * (t_exit - t_enter)
 
 
-def _channels(_: tuple, part: tuple) -> Float[Array, "chunk C+2"]:
+def opacities_at(
+    opacities: HashTables, segments: TetSegments, places: Float[Array, "N 4"], num_used: Int[Array, ""]
+) -> Float[Array, " N"]:
+    """Of each segment, below 1."""
+    texels = encode(opacities, ONE_LEVEL, segments.tet_ids, places, num_used)
+    return map_used(_opacity, (), (texels, segments.lambda_exit), num_used)
+
+
+def _opacity(_: tuple, part: tuple) -> Float[Array, " chunk"]:
+    return jnp.clip(in_basis(*part)[:, 0], 0, MAX_OPACITY)
+
+
+def _channels(_: tuple, part: tuple) -> Float[Array, "chunk K+2"]:
+    """What the ray gathers by weight: channels, 1 and t."""
     texels, lambda_exit, t = part
-    values = in_basis(texels, lambda_exit)
-    opacity = jnp.clip(values[:, 0], 0, MAX_OPACITY)
-    return jnp.column_stack([opacity[:, None] * values[:, 1:], opacity, opacity * t])
-
-
-def has_textures(baked: BakedImpostor) -> Bool[Array, " T"]:
-    """Tets that show anything."""
-    return baked.textures.layout.resolutions[:, 0] > 0  # type: ignore[union-attr]
+    return jnp.column_stack([in_basis(texels, lambda_exit), jnp.ones_like(t), t])
 
 
 def in_basis(

@@ -1,12 +1,14 @@
 """Where rays enter the cage: the front-facing boundary faces on each ray's line, in order.
 
-Up to `MAX_CULLED` clusters of boundary faces are culled by a tile of rays together, with a cone around all
-of them; more are the leaves of a tree of boxes, which every ray descends on its own.
+A tile of rays culls clusters of boundary faces together, with a cone around all of its rays. Where more than
+`MAX_CULLED` are left, because there are many or the rays have no order, every ray descends a tree of boxes on
+its own, whose leaves the clusters are.
 
 Axes: B entries, T tets; rays are lanes, the last axis.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +26,7 @@ from nimpostor_jax.geometry.intersect import (
 )
 
 MAX_CULLED = 512  # clusters that a tile tests one by one; more would cost each ray T^(2/3)
+MAX_FLAGGED = 1 << 13  # clusters that a tile holds against its cone; of more, rays descend the tree
 
 
 @struct.dataclass
@@ -88,17 +91,28 @@ def search_entries(
         jnp.full((slots, lanes), -1, jnp.int32),
         jnp.zeros(lanes, jnp.int32),
     )
-    search = _entries_of_tile if tables.face_holds.shape[0] <= MAX_CULLED else _entries_of_lanes
-    unsure, (_, holds, count) = search(tables, origin, axes, test_face, (jnp.zeros(lanes, bool), empty))
+    start, clusters = (jnp.zeros(lanes, bool), empty), tables.face_holds.shape[0]
+
+    def by_lanes() -> tuple:
+        return _entries_of_lanes(tables, origin, axes, test_face, start)
+
+    if clusters > MAX_FLAGGED:
+        found = by_lanes()
+    else:
+        near = _near_clusters(tables, origin, axes[2])
+        by_tile = partial(_entries_of_tile, tables, near, test_face, start)
+        few = jnp.sum(near) <= MAX_CULLED
+        found = by_tile() if clusters <= MAX_CULLED else jax.lax.cond(few, by_tile, by_lanes)
+    unsure, (_, holds, count) = found
     return holds, count, unsure
 
 
 def _entries_of_tile(
-    tables: MarchTables, origin: tuple, axes: tuple, test_face: Callable[..., tuple], found: tuple
+    tables: MarchTables, near: Bool[Array, " clusters"], test_face: Callable[..., tuple], found: tuple
 ) -> tuple:
     """Fold `test_face` over the clusters near any of the tile's lines: all lanes test the same face."""
     clusters, width = tables.face_holds.shape
-    words = _pack_bits(_near_clusters(tables, origin, axes[2]))
+    words = _pack_bits(near)
 
     def test_cluster(cluster: Int[Array, ""], found: tuple) -> tuple:
         def test(i: Int[Array, ""], found: tuple) -> tuple:

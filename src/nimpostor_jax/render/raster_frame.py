@@ -10,7 +10,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int
 
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.render.baked import has_textures, shade_segments
+from nimpostor_jax.render.baked import shade_segments
 from nimpostor_jax.render.camera import TILE, to_local
 from nimpostor_jax.render.capacity import MAX_GROWTH, grow_march
 from nimpostor_jax.render.frame import Frame, device_mesh, empty_outputs
@@ -40,7 +40,8 @@ def rasterize_frame(baked: BakedImpostor, camera: Camera, config: RenderConfig) 
     RuntimeError where 2**6 times the given sizes do not suffice.
     """
     screen, depth = _to_screen(baked.mesh, camera)
-    behind = np.flatnonzero(~(np.asarray(depth) > 0))
+    used = np.unique(np.asarray(baked.mesh.tets))
+    behind = used[~(np.asarray(depth)[used] > 0)]
     if behind.size:
         raise ValueError(
             f"{behind.size} vertices of the cage are not in front of the camera; first: {behind[0]}; "
@@ -83,7 +84,7 @@ def _all_lists(baked: BakedImpostor, screen: Screen, camera: Camera) -> TileList
     """The tets of all tiles, in as large a buffer as they need."""
     capacity = _rounded(4 * len(baked.mesh.tets))
     while True:
-        lists = _bin_tets(baked.mesh, has_textures(baked), screen, camera, capacity)
+        lists = _bin_tets(baked.mesh, screen, camera, capacity)
         if lists.num_pairs <= capacity:
             return lists
         capacity = _rounded(int(lists.num_pairs))
@@ -135,6 +136,6 @@ def _render_tiles(
         capacity = (config.march.capacity_per_ray or layers) * rays.origins.shape[0]
         near = config.near / baked.mesh.scale
         segments = locate_segments(baked.mesh, rays, crossings, near, capacity)
-        return shade_segments(baked, rays, segments)
+        return shade_segments(baked, rays, segments, config)
 
     return shard(baked, camera, screen, lists, tiles)

@@ -72,10 +72,8 @@ def tiles_of(camera: Camera) -> tuple[int, int]:
     return -(-camera.height // TILE), -(-camera.width // TILE)
 
 
-def bin_tets(
-    mesh: TetMesh, shown: Bool[Array, " T"], screen: Screen, camera: Camera, capacity: int
-) -> TileLists:
-    """Sort the shown tets into the tiles that their bounding rectangles meet, `capacity` pairs at most."""
+def bin_tets(mesh: TetMesh, screen: Screen, camera: Camera, capacity: int) -> TileLists:
+    """Sort the tets into the tiles that their bounding rectangles meet, `capacity` pairs at most."""
     rows, columns = tiles_of(camera)
     corners = screen.positions[mesh.tets]
     x, y = camera.principal[0] + corners[..., 0], camera.principal[1] - corners[..., 1]
@@ -85,7 +83,7 @@ def bin_tets(
     x0, x1 = (jnp.clip(x, low, high) for x, low, high in ((left, 0, columns), (right, -1, columns - 1)))
     y0, y1 = (jnp.clip(y, low, high) for y, low, high in ((top, 0, rows), (bottom, -1, rows - 1)))
     wide, high = (jnp.maximum(b - a + 1, 0).astype(jnp.int32) for a, b in ((x0, x1), (y0, y1)))
-    counts = jnp.where(shown, wide * high, 0)
+    counts = wide * high
     firsts = jnp.cumsum(counts) - counts
     # Tets with pairs mark their first; a running maximum spreads the marks, which ascend.
     marked = jnp.where(counts > 0, firsts, capacity)

@@ -1,10 +1,10 @@
 """Fitting face textures to a field: what rays gather in single tets, then whole pictures (Sec. 3.4).
 
-Axes: R rays, N packed segments, M samples, C features, U tets of the cage that is baked.
+Axes: R rays, N packed segments, M samples, C features, K channels, D decoder sets,
+U tets of the cage that is baked.
 """
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -14,18 +14,22 @@ import optax
 from flax import struct
 from jaxtyping import Array, Float, Int
 
+from nimpostor_jax.chunks import map_used
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.encoding.face_grid import ONE_LEVEL, FaceGrid
-from nimpostor_jax.render.baked import BASIS, render_baked_rays, seen_at, seen_on_face
+from nimpostor_jax.field.decoder import apply_layers, num_decoder_sets
+from nimpostor_jax.render.baked import BASIS, places_seen, render_baked_rays
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import blend_background, sample_weights, sum_by_ray, transmittance
 from nimpostor_jax.render.sampling import place_samples, plan_samples
 from nimpostor_jax.render.segments import in_cells, march_segments
 from nimpostor_jax.render.selection import present_samples, sample_densities, visible_samples
 from nimpostor_jax.train.losses import photometric
-from nimpostor_jax.train.step import Parameters, RayBatch
+from nimpostor_jax.train.row_adam import RowMoments, no_row_moments, update_rows
+from nimpostor_jax.train.step import Parameters, RayBatch, make_optimizer
 from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, NeuralImpostor, TetSegments
 
+TABLES = ("depths", "opacities", "textures")
 RIDGE = 1e-3  # of a texel's evidence, against dependence on the direction
 FACE_EVIDENCE = 0.05  # rays that a face's mean counts for in each of its texels
 SOLVED = 1 << 16  # texels at a time
@@ -39,13 +43,16 @@ class Gathered:
     light: Float[Array, " N"]  # that reaches the segment; 0 in empty slots
     opacity: Float[Array, " N"]
     share: Float[Array, " N"]  # of the segment at which it is seen, on average
-    features: Float[Array, "N C"]  # their mean
+    features: Float[Array, "N C"]  # their mean, or that of the channels made of them
 
 
 def gather_by_tet(
-    impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig
+    impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig, layers: list | None = None
 ) -> Gathered:
-    """Sample the field along a batch of rays, and sum within each tet of the mesh (Eq. 10)."""
+    """Sample the field along a batch of rays, and sum within each tet of the mesh (Eq. 10).
+
+    Summed are the features, or what `layers` (`decoder.principal_channels`) make of them.
+    """
     local = to_local(impostor.mesh, batch.rays)
     segments = march_segments(impostor.mesh, local, config, entries=batch.entries)
     in_field = in_cells(segments, impostor.embedding)
@@ -55,6 +62,9 @@ def gather_by_tet(
     samples, owners = place_samples(plan, chosen, count), plan.owners[chosen]
     sigmas = sample_densities(impostor, samples.tet_ids, features, count)
     depths = jnp.where(jnp.arange(owners.size) < count, sigmas * samples.deltas, 0)
+    if layers is not None:
+        items = (features, impostor.decoder_index[samples.tet_ids])
+        features = map_used(_through, layers, items, count)
     lengths = segments.t_exit - segments.t_enter
     share = (samples.t - segments.t_enter[owners]) / jnp.where(lengths > 0, lengths, 1)[owners]
     values = jnp.column_stack([features, jnp.ones_like(share), share])
@@ -69,16 +79,38 @@ def gather_by_tet(
     )
 
 
-def add_visible(
-    found: Float[Array, "U 2"],
-    impostor: NeuralImpostor,
-    batch: RayBatch,
-    config: RenderConfig,
-) -> Float[Array, "U 2"]:
-    """Add, by tet, the light that reaches it along a batch of rays, and what it takes of that."""
+def _through(layers: list, part: tuple) -> Float[Array, "chunk K"]:
+    return apply_layers(layers, *part)
+
+
+@struct.dataclass
+class Seen:
+    """What a mesh shows of a field, as sums over rays."""
+
+    light: Float[Array, " U"]  # that reaches each tet
+    taken: Float[Array, " U"]  # by it
+    products: Float[Array, "D C C"]  # of what tets show, features with features, by decoder set
+
+
+def nothing_seen(impostor: NeuralImpostor) -> Seen:
+    """Before the first ray."""
+    by_tet, features = jnp.zeros(len(impostor.mesh.tets)), impostor.config.encoding.feature_dim
+    products = jnp.zeros((num_decoder_sets(impostor.decoders), features, features))
+    return Seen(light=by_tet, taken=by_tet, products=products)
+
+
+def add_seen(seen: Seen, impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig) -> Seen:
+    """Add what a batch of rays sees."""
     gathered = gather_by_tet(impostor, batch, config)
-    values = jnp.stack([gathered.light, gathered.light * gathered.opacity], axis=1)
-    return found.at[jnp.maximum(gathered.segments.tet_ids, 0)].add(values)
+    tets, taken = jnp.maximum(gathered.segments.tet_ids, 0), gathered.light * gathered.opacity
+    cells = tets if impostor.embedding is None else impostor.embedding.cells[tets]
+    mine = impostor.decoder_index[cells] == jnp.arange(seen.products.shape[0])[:, None]
+    features = gathered.features
+    return Seen(
+        light=seen.light.at[tets].add(gathered.light),
+        taken=seen.taken.at[tets].add(taken),
+        products=seen.products + jnp.einsum("dn,nc,nk->dck", mine * taken, features, features),
+    )
 
 
 @struct.dataclass
@@ -112,15 +144,16 @@ def add_depths(
 def add_contents(
     moments: tuple[Moments, Moments],
     impostor: NeuralImpostor,
+    layers: list,
     depths: HashTables,
     batch: RayBatch,
     config: RenderConfig,
 ) -> tuple[Moments, Moments]:
-    """Add opacity, and features by opacity, by the point where `depths` says that they are seen."""
-    gathered = gather_by_tet(impostor, batch, config)
+    """Add opacity, and channels by opacity, by the point where `depths` says that they are seen."""
+    gathered = gather_by_tet(impostor, batch, config, layers)
     segments = gathered.segments
-    share = seen_at(depths, segments, jnp.int32(segments.rays.size))
-    places = seen_on_face((), (segments.lambda_enter, segments.lambda_exit, share))
+    used = dataclasses.replace(segments, tet_ids=jnp.maximum(segments.tet_ids, 0))
+    places, _ = places_seen(depths, used, jnp.int32(segments.rays.size))
     layout: FaceLayout = depths.layout  # type: ignore[assignment]
     add = partial(_add, layout=layout, segments=segments, places=places)
     mass = gathered.light
@@ -139,7 +172,6 @@ def _add(
     channels: Float[Array, "N channels"],
 ) -> Moments:
     tet_ids = jnp.maximum(segments.tet_ids, 0)
-    mass *= layout.resolutions[tet_ids, 0] > 0
     grid, level = FaceGrid(ONE_LEVEL, layout), jnp.int32(0)
     points = grid.prepare(tet_ids, places)
     basis = segments.lambda_exit
@@ -181,21 +213,15 @@ def solve_moments(
 
 def baked_parameters(baked: BakedImpostor) -> Parameters:
     """What refinement trains."""
-    return {
-        "depths": baked.depths.features,
-        "textures": baked.textures.features,
-        "decoders": baked.decoders,
-    }
+    return {name: getattr(baked, name).features for name in TABLES} | {"decoders": baked.decoders}
 
 
 def with_baked_parameters(baked: BakedImpostor, parameters: Parameters) -> BakedImpostor:
     """The baked impostor with its trained arrays replaced."""
-    return dataclasses.replace(
-        baked,
-        depths=dataclasses.replace(baked.depths, features=parameters["depths"]),
-        textures=dataclasses.replace(baked.textures, features=parameters["textures"]),
-        decoders=parameters["decoders"],
-    )
+    tables = {
+        name: dataclasses.replace(getattr(baked, name), features=parameters[name]) for name in TABLES
+    }
+    return dataclasses.replace(baked, **tables, decoders=parameters["decoders"])
 
 
 def baked_loss(
@@ -209,22 +235,42 @@ def baked_loss(
     return photometric(color, target, output.overflow)
 
 
+@struct.dataclass
+class RefineState:
+    """What a step of refinement changes."""
+
+    parameters: Parameters
+    moments: dict[str, RowMoments]  # of the tables, of whose texels a batch touches few
+    decoders: optax.OptState
+
+
+def init_refinement(baked: BakedImpostor) -> RefineState:
+    """The state before the first step, of copies: steps may consume it."""
+    parameters = jax.tree.map(jnp.copy, baked_parameters(baked))
+    return RefineState(
+        parameters=parameters,
+        moments={name: no_row_moments(parameters[name]) for name in TABLES},
+        decoders=make_optimizer().init(parameters["decoders"]),
+    )
+
+
 def refine_step(
-    parameters: Parameters,
-    optimizer_state: optax.OptState,
+    state: RefineState,
     baked: BakedImpostor,
     batch: RayBatch,
     rate: Float[Array, ""],
+    decoder_rate: Float[Array, ""],
     *,
     config: RenderConfig,
-    optimizer: optax.GradientTransformation,
-    share: Callable[[str], float],
-) -> tuple[Parameters, optax.OptState, Float[Array, ""]]:
-    """One step of Adam; pure. `share` of the learning rate `rate` is what a part of the parameters gets."""
-    loss, gradients = jax.value_and_grad(baked_loss)(parameters, baked, batch, config)
-    updates, optimizer_state = optimizer.update(gradients, optimizer_state, parameters)
-    parameters = {
-        name: jax.tree.map(lambda p, u, name=name: p - rate * share(name) * u, part, updates[name])
-        for name, part in parameters.items()
-    }
-    return parameters, optimizer_state, loss
+) -> tuple[RefineState, Float[Array, ""]]:
+    """One step of Adam on a batch, and the loss before it; pure."""
+    loss, gradients = jax.value_and_grad(baked_loss)(state.parameters, baked, batch, config)
+    parameters, moments = {}, {}
+    for name in TABLES:
+        updated = update_rows(state.parameters[name], state.moments[name], gradients[name], rate)
+        parameters[name], moments[name] = updated
+    updates, decoders = make_optimizer().update(gradients["decoders"], state.decoders)
+    parameters["decoders"] = jax.tree.map(
+        lambda p, u: p - decoder_rate * u, state.parameters["decoders"], updates
+    )
+    return RefineState(parameters=parameters, moments=moments, decoders=decoders), loss

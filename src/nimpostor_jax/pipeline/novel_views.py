@@ -1,0 +1,84 @@
+"""Pictures that an impostor renders of itself from between the cameras of a scene."""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+from tqdm.auto import tqdm
+
+from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.io.blender import PosedImages
+from nimpostor_jax.pipeline.evaluate import camera_of
+from nimpostor_jax.render.frame import frame_config, render_frame
+from nimpostor_jax.types import NeuralImpostor
+
+NEIGHBOURS = 6  # of a camera; a new one lies between it and two of them
+
+
+def with_novel_views(
+    views: PosedImages, impostor: NeuralImpostor, count: int, config: RenderConfig, seed: int = 0
+) -> PosedImages:
+    """The views and `count` more from between their cameras, as the impostor shows them.
+
+    Lenses are those of views. Where the views have backgrounds, the new ones stand before plain grey.
+    """
+    if not count:
+        return views
+    rng = np.random.default_rng(seed)
+    poses = poses_between(views.camera_to_world, count, rng)
+    lenses = rng.integers(len(views), size=count)
+    blank = views.select(lenses)
+    cameras = PosedImages(
+        images=np.zeros_like(blank.images),
+        camera_to_world=poses,
+        focal=blank.focal,
+        principal=blank.principal,
+        names=tuple(f"between_{i}" for i in range(count)),
+        has_alpha=np.full(count, views.backgrounds is None),
+        backgrounds=None if views.backgrounds is None else np.full_like(blank.backgrounds, 0.5),
+    )
+    sized = frame_config(impostor, camera_of(cameras, 0), config)
+    for i in tqdm(range(count), desc="novel views", unit="view", disable=None):
+        frame = render_frame(impostor, camera_of(cameras, i), sized)
+        cameras.images[i] = np.concatenate([frame.color, frame.opacity[..., None]], axis=-1)
+        if cameras.backgrounds is not None:
+            cameras.images[i, ..., :3] += (1 - frame.opacity[..., None]) * cameras.backgrounds[i]
+            cameras.images[i, ..., 3] = 1
+    return joined(views, cameras)
+
+
+def poses_between(
+    camera_to_world: Float[np.ndarray, "N 4 4"], count: int, rng: np.random.Generator
+) -> Float[np.ndarray, "count 4 4"]:
+    """Poses between random cameras and two each of their `NEIGHBOURS`, by random weights that add up to 1.
+
+    Neighbours are near in place, measured in the spread of all places, and in direction of view.
+    """
+    places, rotations = camera_to_world[:, :3, 3], camera_to_world[:, :3, :3]
+    spread = np.linalg.norm(places - places.mean(axis=0), axis=1).max()
+    keys = np.concatenate([places / max(spread, 1e-12), rotations[:, :, 2]], axis=1)
+    distances = np.linalg.norm(keys[:, None] - keys, axis=-1)
+    near = np.argsort(distances, axis=1)[:, : NEIGHBOURS + 1]  # each camera first of its own
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose in poses:
+        around = near[rng.integers(len(near))]
+        chosen = np.concatenate([around[:1], rng.permutation(around[1:])[:2]])
+        weights = rng.dirichlet(np.ones(len(chosen)))
+        pose[:3, 3] = weights @ places[chosen]
+        pose[:3, :3] = Rotation.from_matrix(rotations[chosen]).mean(weights).as_matrix()
+    return poses
+
+
+def joined(first: PosedImages, second: PosedImages) -> PosedImages:
+    """The views of both, of one size."""
+    backgrounds = None
+    if first.backgrounds is not None and second.backgrounds is not None:
+        backgrounds = np.concatenate([first.backgrounds, second.backgrounds])
+    return PosedImages(
+        images=np.concatenate([first.images, second.images]),
+        camera_to_world=np.concatenate([first.camera_to_world, second.camera_to_world]),
+        focal=np.concatenate([first.focal, second.focal]),
+        principal=np.concatenate([first.principal, second.principal]),
+        names=first.names + second.names,
+        has_alpha=np.concatenate([first.has_alpha, second.has_alpha]),
+        backgrounds=backgrounds,
+    )

@@ -1,0 +1,61 @@
+"""Adam for tables of which a batch touches few rows: the others are not read and do not move.
+
+Kingma and Ba (2015), with Instant-NGP's constants as `train.step.make_optimizer`. Moments of a row decay with
+the steps that touch it, as in PyTorch's SparseAdam. Axes: N rows, F numbers each.
+"""
+
+import jax.numpy as jnp
+from flax import struct
+from jaxtyping import Array, Float, Int
+
+from nimpostor_jax.chunks import default_chunk, for_chunks, packed_indices, padded_size, take
+
+B1, B2, EPSILON = 0.9, 0.99, 1e-15
+
+
+@struct.dataclass
+class RowMoments:
+    """What Adam keeps of a table."""
+
+    first: Float[Array, "N F"]
+    second: Float[Array, "N F"]
+    steps: Int[Array, ""]
+
+
+def no_row_moments(table: Float[Array, "N F"]) -> RowMoments:
+    """Before the first step."""
+    return RowMoments(
+        first=jnp.zeros_like(table), second=jnp.zeros_like(table), steps=jnp.zeros((), jnp.int32)
+    )
+
+
+def update_rows(
+    table: Float[Array, "N F"],
+    moments: RowMoments,
+    gradient: Float[Array, "N F"],
+    rate: Float[Array, ""],
+) -> tuple[Float[Array, "N F"], RowMoments]:
+    """The table after a step at a learning rate; rows without gradient stay as they are. Pure."""
+    count = table.shape[0]
+    rows, num_touched = packed_indices(jnp.any(gradient != 0, axis=1))
+    chunk, order = default_chunk(count), jnp.arange(count, dtype=jnp.int32)
+    rows = jnp.where(order < num_touched, rows, count)
+    rows = jnp.pad(rows, (0, padded_size(count, chunk) - count), constant_values=count)
+    steps = moments.steps + 1
+    unbiased = [1 - b ** steps.astype(table.dtype) for b in (B1, B2)]
+
+    def update(start: Int[Array, ""], tables: tuple) -> tuple:
+        table, first, second = tables
+        at = take(rows, start, chunk)
+        slope, one, two = (x.at[at].get(mode="fill", fill_value=0) for x in (gradient, first, second))
+        one = B1 * one + (1 - B1) * slope
+        two = B2 * two + (1 - B2) * slope**2
+        moved = rate * (one / unbiased[0]) / (jnp.sqrt(two / unbiased[1]) + EPSILON)
+        return (
+            table.at[at].add(-moved, mode="drop"),
+            first.at[at].set(one, mode="drop"),
+            second.at[at].set(two, mode="drop"),
+        )
+
+    table, first, second = for_chunks(num_touched, chunk, update, (table, moments.first, moments.second))
+    return table, RowMoments(first=first, second=second, steps=steps)
