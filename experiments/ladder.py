@@ -42,6 +42,7 @@ QUICK = (
     "TrainConfig.warmup_steps=5",
     "TrainConfig.rays_per_batch=512",
     "BakeConfig.fit_rays=20000",
+    "BakeConfig.novel_views=4",
     "BakeConfig.refine_steps=10",
 )
 QUICK_RESOLUTION = 24

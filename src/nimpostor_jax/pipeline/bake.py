@@ -53,6 +53,7 @@ LOOK_VIEWS, LOOK_RAYS = 32, 250_000  # to find out what is visible at all
 DEPTHS_SHARE = 0.5  # of the rays: for how deep in the tets something lies
 FINAL_RATE = 0.1  # of the learning rate, at the end of the refinement
 DECODER_SHARE = 0.2  # of it
+LOST_SHARE = 1e-3  # of the rays, above which it is reported that they do not fit
 
 
 def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log = print) -> BakedImpostor:
@@ -245,17 +246,20 @@ def refine(
         return baked
     compiled = jax.jit(partial(refine_step, config=render), donate_argnums=0)
     state = init_refinement(baked)
-    key, losses = jax.random.key(train.seed + 3), []
+    key, found = jax.random.key(train.seed + 3), []
     for i in tqdm(range(config.refine_steps), desc="refine", unit="step", disable=None):
         batch = draw_batch(key, i, pool, train.rays_per_batch, "random")
         rate = config.learning_rate * FINAL_RATE ** (i / config.refine_steps)
         decoder_rate = DECODER_SHARE * rate if config.refine_decoders else 0.0
-        state, loss = compiled(state, baked, batch, jnp.float32(rate), jnp.float32(decoder_rate))
-        losses.append(loss)
+        state, loss_and_lost = compiled(state, baked, batch, jnp.float32(rate), jnp.float32(decoder_rate))
+        found.append(loss_and_lost)
         if i % SYNC_EVERY == 0:
-            jax.block_until_ready(loss)
-    first, last = (np.mean([float(x) for x in part]) for part in (losses[:20], losses[-20:]))
+            jax.block_until_ready(loss_and_lost)
+    losses, lost = np.array(found).T
+    first, last = losses[:20].mean(), losses[-20:].mean()
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
+    if lost.mean() > LOST_SHARE:
+        log(f"{lost.mean():.1%} of the rays crossed more tets than buffers hold, and were left out")
     return with_baked_parameters(baked, state.parameters)
 
 

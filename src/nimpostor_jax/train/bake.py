@@ -40,7 +40,7 @@ class Gathered:
     """What rays gather on their way through the tets."""
 
     segments: TetSegments
-    light: Float[Array, " N"]  # that reaches the segment; 0 in empty slots
+    light: Float[Array, " N"]  # that reaches the segment; 0 in empty slots, and of rays that do not fit
     opacity: Float[Array, " N"]
     share: Float[Array, " N"]  # of the segment at which it is seen, on average
     features: Float[Array, "N C"]  # their mean, or that of the channels made of them
@@ -71,7 +71,8 @@ def gather_by_tet(
     num_segments = segments.rays.size
     sums = sum_by_ray(sample_weights(depths, owners, count), values, owners, num_segments, count)
     by_tet = jax.ops.segment_sum(depths, owners, num_segments, indices_are_sorted=True)
-    light = jnp.where(segments.tet_ids >= 0, transmittance(by_tet, segments.rays), 0)
+    fits = ~(segments.overflow | samples.overflow)[segments.rays]
+    light = jnp.where((segments.tet_ids >= 0) & fits, transmittance(by_tet, segments.rays), 0)
     opacity = sums[:, -2]
     means = sums / jnp.where(opacity > 0, opacity, 1)[:, None]
     return Gathered(
@@ -226,13 +227,13 @@ def with_baked_parameters(baked: BakedImpostor, parameters: Parameters) -> Baked
 
 def baked_loss(
     parameters: Parameters, baked: BakedImpostor, batch: RayBatch, config: RenderConfig
-) -> Float[Array, ""]:
-    """Photometric loss of a batch over its backgrounds."""
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Photometric loss of a batch over its backgrounds, without rays that do not fit; and their share."""
     baked = with_baked_parameters(baked, parameters)
     output = render_baked_rays(baked, batch.rays, config, entries=batch.entries)
     color = blend_background(output.color, output.opacity, batch.background)
     target = blend_background(batch.target[:, :3], batch.target[:, 3], batch.background)
-    return photometric(color, target, output.overflow)
+    return photometric(color, target, output.overflow), jnp.mean(output.overflow)
 
 
 @struct.dataclass
@@ -262,9 +263,10 @@ def refine_step(
     decoder_rate: Float[Array, ""],
     *,
     config: RenderConfig,
-) -> tuple[RefineState, Float[Array, ""]]:
-    """One step of Adam on a batch, and the loss before it; pure."""
-    loss, gradients = jax.value_and_grad(baked_loss)(state.parameters, baked, batch, config)
+) -> tuple[RefineState, Float[Array, " 2"]]:
+    """One step of Adam on a batch, and `baked_loss` before it; pure."""
+    value_and_grad = jax.value_and_grad(baked_loss, has_aux=True)
+    found, gradients = value_and_grad(state.parameters, baked, batch, config)
     parameters, moments = {}, {}
     for name in TABLES:
         updated = update_rows(state.parameters[name], state.moments[name], gradients[name], rate)
@@ -273,4 +275,4 @@ def refine_step(
     parameters["decoders"] = jax.tree.map(
         lambda p, u: p - decoder_rate * u, state.parameters["decoders"], updates
     )
-    return RefineState(parameters=parameters, moments=moments, decoders=decoders), loss
+    return RefineState(parameters=parameters, moments=moments, decoders=decoders), jnp.stack(found)
