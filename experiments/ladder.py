@@ -148,7 +148,10 @@ def bake_or_reuse(trained: Trained, workdir: Path) -> tuple[BakedImpostor, Row]:
         "fps": 1 / result["seconds_per_frame"],
         "raster_fps": fps,
         "raster_difference": float(difference),
-        "parameters": int(baked.textures.features.size),
+        "parameters": sum(
+            int(table.features.size) for table in (baked.depths, baked.opacities, baked.textures)
+        ),
+        "tets": len(baked.mesh.tets),
     }
     with atomic_path(settings) as path:
         path.write_text(text, encoding="utf-8")
