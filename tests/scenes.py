@@ -60,6 +60,15 @@ def constant_density(made, bias):
     return made.replace(decoders=made.decoders | {"density": density})
 
 
+def pushed_together(impostor):
+    """An impostor on "blobs", baked or not, with the second cloud moved into the first."""
+    vertices = np.asarray(impostor.mesh.vertices)
+    second = np.arange(len(vertices)) >= len(vertices) // 2
+    shift = 0.9 * (vertices[second].mean(axis=0) - vertices[~second].mean(axis=0))
+    moved = jnp.asarray(np.where(second[:, None], vertices - shift, vertices))
+    return impostor.replace(mesh=impostor.mesh.replace(vertices=moved))
+
+
 def look_at(position, target, dtype="float32"):
     """A camera-to-world matrix (OpenGL axes)."""
     back = unit(np.asarray(position, float) - np.asarray(target, float))

@@ -1,5 +1,6 @@
 """A baked impostor with random textures, for the tests of marching and rasterizing it."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scenes
@@ -11,8 +12,8 @@ from nimpostor_jax.types import BakedImpostor, HashTables
 CHANNELS = 3
 
 
-def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0)):
-    """Textures of 1 to 8 texels along an edge, opacities between the given ones."""
+def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), num_sets=1):
+    """Textures of 1 to 8 texels along an edge, opacities between the given ones; decoder sets take turns."""
     made = scenes.impostor(name, dtype)
     rng = np.random.default_rng(seed)
     resolutions = rng.integers(1, 9, (len(made.mesh.tets), 4))
@@ -24,14 +25,15 @@ def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0)):
 
     seen = rng.uniform(*opacity, (count, 4, 1))
     size = made.config.encoding.feature_dim
-    products = np.eye(size) * rng.uniform(1, 2, (1, size, 1))
-    decoders, _ = principal_channels(made.decoders, products, CHANNELS)
+    several = jax.tree.map(lambda x: jnp.concatenate([(1 - i) * x for i in range(num_sets)]), made.decoders)
+    products = np.eye(size) * rng.uniform(1, 2, (num_sets, size, 1))
+    decoders, _ = principal_channels(several, products, CHANNELS)
     return BakedImpostor(
         mesh=made.mesh,
         depths=tables(rng.uniform(size=seen.shape)),
         opacities=tables(seen),
         textures=tables(rng.normal(size=(count, 4, CHANNELS))),
         decoders=decoders,
-        decoder_index=made.decoder_index,
+        decoder_index=jnp.arange(len(resolutions), dtype=jnp.int32) % num_sets,
         config=made.config,
     )

@@ -49,6 +49,16 @@ def test_a_camera_or_two_are_enough(count, rng):
     assert_allclose(np.linalg.det(poses[:, :3, :3]), 1)
 
 
+def test_cameras_around_an_object_have_none_in_it_between_them(rng):
+    angle = np.arange(4) * np.pi / 2
+    cameras = dome(4)
+    back = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    right = np.stack([-np.sin(angle), np.cos(angle), 0 * angle], axis=1)
+    cameras[:, :3] = np.stack([right, np.cross(back, right), back, DISTANCE * back], axis=2)
+    poses = poses_between(cameras, 20, rng)
+    assert np.linalg.norm(poses[:, :3, 3], axis=1).min() > 0.99 * DISTANCE  # none are alike
+
+
 def views(backgrounds: np.ndarray | None) -> PosedImages:
     return PosedImages(
         images=np.full((5, 2, 3, 4), 0.25, np.float32),
@@ -84,8 +94,10 @@ def test_new_views_are_premultiplied_like_the_old(half_red):
 
 def test_where_backgrounds_are_known_new_views_stand_before_one(half_red):
     joined = with_novel_views(views(np.zeros((5, 2, 3, 3), np.float32)), None, 4, RenderConfig())
-    assert_allclose(joined.images[5:], np.broadcast_to([0.75, 0.25, 0.25, 1], (4, 2, 3, 4)))
-    assert_allclose(joined.backgrounds[5:], 0.5)
+    behind = joined.backgrounds[5:]
+    assert_allclose(joined.images[5:, ..., :3], [0.5, 0, 0] + 0.5 * behind, atol=1e-6)
+    assert_allclose(joined.images[5:, ..., 3], 1)
+    assert np.ptp(behind, axis=(1, 2)).max() == 0 and np.ptp(behind[:, 0, 0], axis=0).min() > 0.1
     assert not joined.has_alpha.any()
 
 

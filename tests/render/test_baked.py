@@ -11,7 +11,8 @@ import scenes
 from meshes import local_vertices
 from numpy.testing import assert_allclose, assert_array_equal
 from rays import as_rays, generic, missing
-from scenes import exact
+from scenes import exact, pushed_together
+from scenes_baked import CHANNELS
 from scenes_baked import baked as baked_scene
 
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
@@ -62,51 +63,58 @@ def tet_lookup(baked, tet, enter, leave):
     return opacity, share, opacity * texel_lookup(baked.textures, tet, point / point.sum(), leave)
 
 
-def mlp(layers, x):
+def mlp(layers, x, chosen):
     for layer in layers[:-1]:
-        x = np.maximum(x @ np.asarray(layer["weight"][0]) + np.asarray(layer["bias"][0]), 0)
-    return x @ np.asarray(layers[-1]["weight"][0]) + np.asarray(layers[-1]["bias"][0])
+        x = np.maximum(x @ np.asarray(layer["weight"][chosen]) + np.asarray(layer["bias"][chosen]), 0)
+    return x @ np.asarray(layers[-1]["weight"][chosen]) + np.asarray(layers[-1]["bias"][chosen])
 
 
-def pushed_together(baked):
-    """The second cloud moved into the first."""
-    vertices = np.asarray(baked.mesh.vertices)
-    second = np.arange(len(vertices)) >= len(vertices) // 2
-    shift = 0.9 * (vertices[second].mean(axis=0) - vertices[~second].mean(axis=0))
-    moved = jnp.asarray(np.where(second[:, None], vertices - shift, vertices))
-    return baked.replace(mesh=baked.mesh.replace(vertices=moved))
-
-
-@pytest.mark.parametrize("overlapping", [False, True])
-def test_agrees_with_a_loop_over_tets(overlapping, x64):
-    """Where tets overlap, what is seen first comes first."""
-    baked = baked_scene(dtype="float64", opacity=(0.05, 0.95))
+@pytest.mark.parametrize(
+    ("overlapping", "least", "num_sets"), [(False, 0.0, 1), (True, 0.0, 1), (False, 0.05, 2), (True, 0.05, 2)]
+)
+def test_agrees_with_a_loop_over_tets(overlapping, least, num_sets, x64):
+    """Where tets overlap, what is seen first comes first. What contributes little is left out."""
+    baked = baked_scene(dtype="float64", opacity=(0.05, 0.95), num_sets=num_sets)
     baked = pushed_together(baked) if overlapping else baked
     rays = rays_at(baked)
-    output = render(baked, rays, CONFIG)
+    output = render(baked, rays, dataclasses.replace(CONFIG, min_weight=least))
     vertices, tets = local_vertices(baked.mesh)
     center, scale = np.asarray(baked.mesh.center), float(baked.mesh.scale)
+    left_out = 0
     for ray in range(COUNT):
         origin = (np.asarray(rays.origins[ray]) - center) / scale
-        light, sums, depth, opacity = 1.0, 0.0, 0.0, 0.0
+        light, depth = 1.0, 0.0
+        sums, weights = np.zeros((num_sets, CHANNELS)), np.zeros(num_sets)
         looked_up = []
         for low, high, tet, enter, leave in oracles.ray_segments(
             vertices, tets, origin, np.asarray(rays.directions[ray])
         ):
             seen, share, features = tet_lookup(baked, tet, enter, leave)
-            looked_up.append((low + share * (high - low), seen, features))
-        for t, seen, features in sorted(looked_up, key=lambda part: part[0]):
-            sums = sums + light * features
-            opacity += light * seen
-            depth += light * seen * t
+            looked_up.append((low + share * (high - low), seen, features, tet % num_sets))
+        for t, seen, features, chosen in sorted(looked_up, key=lambda part: part[0]):
+            if light * seen >= least:
+                sums[chosen] += light * features
+                weights[chosen] += light * seen
+                depth += light * seen * t
+            else:
+                left_out += 1
             light *= 1 - seen
         view = np.asarray(spherical_harmonics(rays.directions[ray], baked.config.decoder.sh_degree))
-        color = 1 / (1 + np.exp(-mlp(baked.decoders["appearance"], np.append(sums / opacity, view))))
+        color, opacity = np.zeros(3), weights.sum()
+        for chosen in np.flatnonzero(weights):
+            inputs = np.append(sums[chosen] / weights[chosen], view)
+            color += weights[chosen] / (1 + np.exp(-mlp(baked.decoders["appearance"], inputs, chosen)))
         # a few hundred float64 operations
         assert_allclose(output.opacity[ray], opacity, atol=1e-9)
-        assert_allclose(output.color[ray], opacity * color, atol=1e-9)
+        assert_allclose(output.color[ray], color, atol=1e-9)
         assert_allclose(output.depth[ray], depth / opacity * scale, atol=1e-8)
     assert np.std(output.opacity) > 0.01
+    assert (left_out > COUNT) == (least > 0)
+
+
+def test_no_rays_at_all():
+    none = as_rays((np.zeros((0, 3)), np.zeros((0, 3))))
+    assert render(baked_scene(), none, CONFIG).color.shape == (0, 3)
 
 
 def test_rays_that_miss_are_exactly_transparent():

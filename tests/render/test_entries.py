@@ -24,12 +24,16 @@ def walk(mesh, rays):
     return by_ray(locate_segments(mesh, rays, traverse(march_tables(mesh), rays, CONFIG)))
 
 
-@pytest.mark.parametrize(("culled", "flagged"), [(0, 0), (12, 1 << 13)], ids=["rays", "tiles and rays"])
+@pytest.mark.parametrize(("culled", "flagged"), [(0, 0), (20, 1 << 13)], ids=["rays", "tiles and rays"])
 @pytest.mark.parametrize("name", ["nonconvex", "blobs"])
 def test_a_tree_finds_the_entries_that_a_tile_finds(name, culled, flagged, rng, monkeypatch):
     mesh = tet_mesh(name)
     kinds = [make(*local_vertices(mesh), rng, COUNT) for make in (GENERIC | DEGENERATE).values()]
-    rays = as_rays(tuple(np.concatenate(parts) for parts in zip(*kinds, strict=True)))
+    origins, directions = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
+    # Neighbours, too: their tile has 13 or 16 clusters before it, and the others nearly all.
+    tile = CONFIG.tile_size
+    beside = origins[:1] + 0.01 * rng.normal(size=(tile, 3)), np.repeat(directions[:1], tile, axis=0)
+    rays = as_rays((np.concatenate([beside[0], origins]), np.concatenate([beside[1], directions])))
     expected = jax.jit(traverse, static_argnums=2)(march_tables(mesh), rays, CONFIG)
     monkeypatch.setattr(entries, "MAX_CULLED", culled)
     monkeypatch.setattr(entries, "MAX_FLAGGED", flagged)

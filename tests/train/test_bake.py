@@ -1,30 +1,45 @@
 """train.bake: what rays gather in single tets, and the least squares of textures."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
+import scenes_baked
 from meshes import local_vertices
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from rays import as_rays, generic
-from scenes import RENDER, exact
+from scenes import RENDER, exact, pushed_together
 
 from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.render.renderer import render_rays
-from nimpostor_jax.train.bake import Moments, add_seen, gather_by_tet, nothing_seen, solve_moments
+from nimpostor_jax.train.bake import (
+    Moments,
+    add_seen,
+    gather_by_tet,
+    init_refinement,
+    nothing_seen,
+    refine_step,
+    solve_moments,
+    with_baked_parameters,
+)
 from nimpostor_jax.train.sharding import device_mesh, over_rays, replicated, sums_by_device
 from nimpostor_jax.train.step import RayBatch
 
 COUNT = 32
 
 
-@pytest.mark.parametrize("times", [0, 1])
-def test_what_tets_gather_adds_up_to_the_picture(times, x64):
-    """On a cage as coarse as the field's, or finer: samples stay where they are, only sums are cut."""
+@pytest.mark.parametrize(("times", "overlapping"), [(0, False), (1, False), (1, True)])
+def test_what_tets_gather_adds_up_to_the_picture(times, overlapping, x64):
+    """On a cage as coarse as the field's, or finer: samples stay where they are, only sums are cut.
+
+    Where tets overlap, a tet's contribution depends on what it shares its place with, but the sum does not.
+    """
     impostor = scenes.impostor("blobs", "float64")
+    impostor = pushed_together(impostor) if overlapping else impostor
     fine = subdivide(impostor, times)
     march = dataclasses.replace(RENDER.march, max_tets_per_ray=64, max_entries_per_ray=4)
     config = dataclasses.replace(exact(max_samples_per_ray=64, min_weight=1e-12), march=march)
@@ -42,9 +57,56 @@ def test_what_tets_gather_adds_up_to_the_picture(times, x64):
     opacity, depth = (np.bincount(segments.rays, x, COUNT) for x in (seen, places))
     # sums of some dozens of terms, some of them from another side of a face
     assert_allclose(opacity, output.opacity, atol=1e-9)
-    assert_allclose(depth * scale, output.depth * output.opacity, atol=1e-8)
+    assert np.all((found.opacity >= 0) & (found.opacity <= 1))
+    assert bool(np.any(segments.disordered)) == overlapping and int(found.lost) == 0
+    if not overlapping:
+        assert_allclose(depth * scale, output.depth * output.opacity, atol=1e-8)
     assert np.std(opacity) > 0.05
     assert np.sum(np.asarray(segments.tet_ids) >= 0) > COUNT * (2 if times else 1)
+
+
+def test_what_is_seen_is_summed_by_tet_and_by_decoder_set():
+    """Against loops over what rays gather, on tets finer than the field's cells."""
+    made = scenes.impostor("blobs")
+    index = jnp.arange(len(made.mesh.tets), dtype=jnp.int32) % 2
+    both = jax.tree.map(lambda x: jnp.concatenate([x, x]), made.decoders)
+    impostor = subdivide(dataclasses.replace(made, decoders=both, decoder_index=index), 1)
+    origins, directions = generic(*local_vertices(made.mesh), np.random.default_rng(3), COUNT)
+    rays = as_rays((np.asarray(made.mesh.center) + float(made.mesh.scale) * origins, directions))
+    zeros = jnp.zeros((COUNT, 4))
+    batch = RayBatch(rays=rays, target=zeros, background=zeros[:, :3], jitter=jnp.linspace(0, 0.99, COUNT))
+    found = jax.jit(gather_by_tet, static_argnames="config")(impostor, batch, config=RENDER)
+    seen = jax.jit(add_seen, static_argnames="config")(nothing_seen(impostor), impostor, batch, config=RENDER)
+    taken, products = np.zeros(len(impostor.mesh.tets)), np.zeros(seen.products.shape)
+    for tet, light, opacity, features in zip(
+        found.segments.tet_ids, found.light, found.opacity, np.asarray(found.features), strict=True
+    ):
+        if tet >= 0:
+            taken[tet] += light * opacity
+            products[index[impostor.embedding.cells[tet]]] += light * opacity * np.outer(features, features)
+    assert_allclose(seen.taken, taken, rtol=1e-4, atol=1e-6)  # float32 in another order
+    assert_allclose(seen.products, products, rtol=1e-4, atol=1e-5 * np.abs(products).max())
+    assert np.all(np.trace(products, axis1=1, axis2=2) > 0.1)
+
+
+def test_refinement_lowers_the_loss_and_leaves_decoders_alone_at_rate_zero(rng):
+    baked = scenes_baked.baked(num_sets=2)
+    origins, directions = generic(*local_vertices(baked.mesh), rng, COUNT)
+    rays = as_rays((np.asarray(baked.mesh.center) + float(baked.mesh.scale) * origins, directions))
+    target = jnp.full((COUNT, 4), 0.5).at[:, :3].set(jnp.asarray([0.4, 0.1, 0.2]))
+    batch = RayBatch(rays=rays, target=target, background=jnp.zeros((COUNT, 3)), jitter=jnp.zeros(COUNT))
+    march = dataclasses.replace(RENDER.march, max_tets_per_ray=24, max_entries_per_ray=3)
+    step = jax.jit(partial(refine_step, config=dataclasses.replace(RENDER, march=march, min_weight=1e-3)))
+    state, losses = init_refinement(baked), []
+    for _ in range(60):
+        state, (loss, lost) = step(state, baked, batch, jnp.float32(0.02), jnp.float32(0))
+        losses.append(float(loss))
+        assert lost == 0
+    assert losses[-1] < 0.2 * losses[0]
+    refined = with_baked_parameters(baked, state.parameters)
+    jax.tree.map(assert_array_equal, refined.decoders, baked.decoders)
+    for name in ("depths", "opacities", "textures"):
+        assert np.any(getattr(refined, name).features != getattr(baked, name).features)
 
 
 def test_two_devices_add_up_what_one_does():
@@ -76,6 +138,7 @@ def test_least_squares_finds_what_depends_on_the_direction(rng, monkeypatch):
     moments = Moments(
         products=jnp.asarray(np.einsum("nsk,nsl->nkl", basis, basis)),
         sums=jnp.asarray(np.einsum("nsk,nsc->nkc", basis, values)),
+        lost=jnp.int32(0),
     )
     found = solve_moments(moments, np.arange(5))
     monkeypatch.setattr("nimpostor_jax.train.bake.SOLVED", 2)
@@ -89,7 +152,7 @@ def test_texels_that_no_ray_has_seen_take_after_their_face():
     sums = np.zeros((3, 4, 1))
     products = np.zeros((3, 4, 4))
     sums[0], products[0] = 25 * 0.25 * 0.8, 25 * 0.0625  # 25 rays, all through the middle: 0.8
-    moments = Moments(products=jnp.asarray(products), sums=jnp.asarray(sums))
+    moments = Moments(products=jnp.asarray(products), sums=jnp.asarray(sums), lost=jnp.int32(0))
     found = solve_moments(moments, np.array([0, 0, 1]))
     assert_allclose(found[1], 0.8, atol=1e-3)  # the same face
     assert_allclose(found[2], 0, atol=1e-6)  # another face, unseen

@@ -24,7 +24,7 @@ from nimpostor_jax.pipeline.novel_views import with_novel_views
 from nimpostor_jax.pipeline.prepare import Log, Scene
 from nimpostor_jax.render.baked import BASIS
 from nimpostor_jax.render.capacity import fit_capacities
-from nimpostor_jax.render.frame import refined
+from nimpostor_jax.render.frame import for_frames, refined
 from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.bake import (
@@ -49,7 +49,7 @@ FIT_RAYS = 8192  # a call
 FIT_DEVICES = 4  # at most: each has moments as large as the textures
 SYNC_EVERY = 2  # calls that may be under way at once: each has its buffers from the start
 FIT_REFINEMENT = 2.0  # of training's steps: tets are small, and each should get some samples
-LOOK_VIEWS, LOOK_RAYS = 32, 250_000  # to find out what is visible at all
+LOOK_RAYS, LOOKS_A_TET = 250_000, 20  # rays, at least, to find out what is visible at all
 DEPTHS_SHARE = 0.5  # of the rays: for how deep in the tets something lies
 FINAL_RATE = 0.1  # of the learning rate, at the end of the refinement
 DECODER_SHARE = 0.2  # of it
@@ -61,7 +61,8 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
 
     Halves the tets in which something is seen, leaves out the others, fits textures to what rays gather, and
     refines them on whole pictures: the training views, and what the impostor shows from between them. Raises
-    ValueError where the textures would need more than `max_megabytes`, or faces have no area.
+    ValueError for gates and paints, where nothing is seen, where the textures would need more than
+    `max_megabytes`, where faces have no area, and where rays cross more tets than buffers can hold.
     """
     if impostor.gates or impostor.paints:
         raise ValueError("consolidate live operations (gates, paints) before the impostor is baked")
@@ -77,8 +78,10 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     counts = checked_texels(resolutions, BASIS * (2 + num_channels), config, log)
     faces = np.repeat(np.arange(counts.size), counts)
     layout = build_face_layout(resolutions)
-    views = with_novel_views(scene.train, impostor, config.novel_views, scene.config.render, train.seed)
+    ready = for_frames(impostor)
+    views = with_novel_views(scene.train, ready, config.novel_views, scene.config.render, train.seed)
     rays = TrainingRays.of(mesh, views, render, config.fit_rays, train.seed + 2)
+    del views, ready  # the pool has what it needs
 
     def moments(num: int) -> Moments:
         return no_moments(len(faces), num)
@@ -87,8 +90,9 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
         texels = solve_moments(found, faces)
         return HashTables(features=jnp.asarray(texels.reshape(len(faces), -1)), layout=layout)
 
-    depths = rays.add_up(partial(moments, 1), add_depths, DEPTHS_SHARE, "depths", part, layout)
-    depths = table(depths)
+    found = rays.add_up(partial(moments, 1), add_depths, DEPTHS_SHARE, "depths", part, layout)
+    log_lost(int(found.lost) / (DEPTHS_SHARE * config.fit_rays), log)
+    depths = table(found)
     contents = rays.add_up(
         lambda: (moments(1), moments(num_channels)), add_contents, 1.0, "contents", part, layers, depths
     )
@@ -118,7 +122,7 @@ class TrainingRays:
 
     @staticmethod
     def of(mesh: TetMesh, views: PosedImages, config: RenderConfig, count: int, seed: int) -> "TrainingRays":
-        """`count` rays of the views' pixels, all that `add_up` has to draw from."""
+        """`count` draws from the views' pixels whose rays meet the mesh."""
         pool, _ = build_pool(mesh, views.cameras, views.images, config.march, views.backgrounds)
         key, size = jax.random.key(seed), min(FIT_RAYS, count)
         sized = fit_config(mesh, pool, draw_batch(key, 0, pool, size, "white"), config)
@@ -175,13 +179,14 @@ def visible_part(
 
     Rays do not cross the other tets, whose vertices are kept. Raises ValueError where nothing is seen.
     """
-    some = views.select(np.linspace(0, len(views) - 1, min(LOOK_VIEWS, len(views))).round().astype(int))
     vertices, tets = world_vertices(impostor.mesh), np.asarray(impostor.mesh.tets)
     longest = np.median(face_pixels(vertices, tets, views))
     halvings = max(0, math.ceil(math.log2(longest / config.tet_pixels)))
     for i in range(halvings + 1):
-        rays = TrainingRays.of(impostor.mesh, some, render, min(LOOK_RAYS, config.fit_rays), i)
+        count = min(max(LOOK_RAYS, LOOKS_A_TET * len(impostor.mesh.tets)), config.fit_rays)
+        rays = TrainingRays.of(impostor.mesh, views, render, count, i)
         seen = rays.add_up(partial(nothing_seen, impostor), add_seen, 1.0, "look", impostor)
+        log_lost(int(seen.lost) / count, log)
         visible = np.asarray(seen.taken > config.min_opacity * np.maximum(seen.light, 1))
         log(f"something is seen in {visible.sum():,} of {len(visible):,} tets")
         if not visible.any():
@@ -192,7 +197,7 @@ def visible_part(
 
 
 def only_tets(impostor: NeuralImpostor, keep: Bool[np.ndarray, " T"]) -> NeuralImpostor:
-    """The impostor without the other tets of its mesh. Its vertices and its field stay."""
+    """An impostor without gates and paints with some tets of its mesh only. Its vertices and field stay."""
     mesh = impostor.mesh
     vertices, tets = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.tets)
     cells, lambdas = np.arange(len(tets)), np.broadcast_to(np.eye(4), (len(tets), 4, 4))
@@ -258,9 +263,14 @@ def refine(
     losses, lost = np.array(found).T
     first, last = losses[:20].mean(), losses[-20:].mean()
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
-    if lost.mean() > LOST_SHARE:
-        log(f"{lost.mean():.1%} of the rays crossed more tets than buffers hold, and were left out")
+    log_lost(lost.mean(), log)
     return with_baked_parameters(baked, state.parameters)
+
+
+def log_lost(share: float, log: Log) -> None:
+    """Say so where more than a few rays were left out."""
+    if share > LOST_SHARE:
+        log(f"{share:.1%} of the rays crossed more tets, or had more samples, than buffers hold: left out")
 
 
 def face_pixels(

@@ -12,6 +12,7 @@ from nimpostor_jax.render.frame import frame_config, render_frame
 from nimpostor_jax.types import NeuralImpostor
 
 NEIGHBOURS = 6  # of a camera; a new one lies between it and two of them
+MIN_COSINE = 0.5  # of directions of view: means of cameras that face each other would lie in the object
 
 
 def with_novel_views(
@@ -19,22 +20,26 @@ def with_novel_views(
 ) -> PosedImages:
     """The views and `count` more from between their cameras, as the impostor shows them.
 
-    Lenses are those of views. Where the views have backgrounds, the new ones stand before plain grey.
+    Lenses are those of views. Where the views have backgrounds, the new ones stand before plain colours.
     """
     if not count:
         return views
     rng = np.random.default_rng(seed)
     poses = poses_between(views.camera_to_world, count, rng)
     lenses = rng.integers(len(views), size=count)
-    blank = views.select(lenses)
+    size = views.images.shape[1:3]
+    backgrounds = None
+    if views.backgrounds is not None:  # colours of all kinds, so that what is opaque shows
+        plain = rng.uniform(size=(count, 1, 1, 3)).astype(views.backgrounds.dtype)
+        backgrounds = np.broadcast_to(plain, (count, *size, 3))
     cameras = PosedImages(
-        images=np.zeros_like(blank.images),
+        images=np.zeros((count, *size, 4), views.images.dtype),
         camera_to_world=poses,
-        focal=blank.focal,
-        principal=blank.principal,
+        focal=views.focal[lenses],
+        principal=views.principal[lenses],
         names=tuple(f"between_{i}" for i in range(count)),
-        has_alpha=np.full(count, views.backgrounds is None),
-        backgrounds=None if views.backgrounds is None else np.full_like(blank.backgrounds, 0.5),
+        has_alpha=np.full(count, backgrounds is None),
+        backgrounds=backgrounds,
     )
     sized = frame_config(impostor, camera_of(cameras, 0), config)
     for i in tqdm(range(count), desc="novel views", unit="view", disable=None):
@@ -51,17 +56,21 @@ def poses_between(
 ) -> Float[np.ndarray, "count 4 4"]:
     """Poses between random cameras and two each of their `NEIGHBOURS`, by random weights that add up to 1.
 
-    Neighbours are near in place, measured in the spread of all places, and in direction of view.
+    Neighbours are near in place, measured in the spread of all places, and in direction of view, within
+    60 degrees of it.
     """
     places, rotations = camera_to_world[:, :3, 3], camera_to_world[:, :3, :3]
     spread = np.linalg.norm(places - places.mean(axis=0), axis=1).max()
     keys = np.concatenate([places / max(spread, 1e-12), rotations[:, :, 2]], axis=1)
     distances = np.linalg.norm(keys[:, None] - keys, axis=-1)
-    near = np.argsort(distances, axis=1)[:, : NEIGHBOURS + 1]  # each camera first of its own
+    alike = rotations[:, :, 2] @ rotations[:, :, 2].T > MIN_COSINE
+    near = np.argsort(np.where(alike, distances, np.inf), axis=1)[:, : NEIGHBOURS + 1]  # itself first
     poses = np.tile(np.eye(4), (count, 1, 1))
     for pose in poses:
-        around = near[rng.integers(len(near))]
-        chosen = np.concatenate([around[:1], rng.permutation(around[1:])[:2]])
+        camera = rng.integers(len(near))
+        others = near[camera, 1:]
+        others = others[alike[camera, others]]
+        chosen = np.concatenate([[camera], rng.permutation(others)[:2]])
         weights = rng.dirichlet(np.ones(len(chosen)))
         pose[:3, 3] = weights @ places[chosen]
         pose[:3, :3] = Rotation.from_matrix(rotations[chosen]).mean(weights).as_matrix()

@@ -142,5 +142,5 @@ def in_basis(
     texels: Float[Array, "M 4*channels"], lambda_exit: Float[Array, "M 4"]
 ) -> Float[Array, "M channels"]:
     """Texels in a direction: linear in the coordinates at which the ray leaves the tet."""
-    coefficients = texels.reshape(texels.shape[0], BASIS, -1)
+    coefficients = texels.reshape(texels.shape[0], BASIS, texels.shape[1] // BASIS)
     return jnp.sum(lambda_exit[:, :, None] * coefficients, axis=1)

@@ -1,8 +1,8 @@
 """Where rays enter the cage: the front-facing boundary faces on each ray's line, in order.
 
 A tile of rays culls clusters of boundary faces together, with a cone around all of its rays. Where more than
-`MAX_CULLED` are left, because there are many or the rays have no order, every ray descends a tree of boxes on
-its own, whose leaves the clusters are.
+`MAX_CULLED` are left, since the rays have no order, or there are more than `MAX_FLAGGED` to begin with, every
+ray descends a tree of boxes on its own, whose leaves the clusters are.
 
 Axes: B entries, T tets; rays are lanes, the last axis.
 """

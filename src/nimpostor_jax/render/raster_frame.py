@@ -33,9 +33,9 @@ _bin_tets = jax.jit(bin_tets, static_argnames="capacity")
 
 
 def rasterize_frame(baked: BakedImpostor, camera: Camera, config: RenderConfig) -> Frame:
-    """Render one camera by rasterization; the same picture as `render_frame`'s.
+    """Render one camera by rasterization; with a config of `frame_config`, `render_frame`'s picture.
 
-    Of the config only the march's sizes matter (`frame_config`). Tiles with pixels that see more tets than
+    Of that only the march's sizes, `near` and `min_weight` matter. Tiles with pixels that see more tets than
     there are layers are done again with more. Raises ValueError where a vertex is not in front of the camera,
     RuntimeError where 2**6 times the given sizes do not suffice.
     """

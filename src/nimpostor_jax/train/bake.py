@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.chunks import map_used
 from nimpostor_jax.config import RenderConfig
@@ -44,6 +44,7 @@ class Gathered:
     opacity: Float[Array, " N"]
     share: Float[Array, " N"]  # of the segment at which it is seen, on average
     features: Float[Array, "N C"]  # their mean, or that of the channels made of them
+    lost: Int[Array, ""]  # rays that did not fit into the buffers
 
 
 def gather_by_tet(
@@ -59,6 +60,8 @@ def gather_by_tet(
     plan = plan_samples(in_field, config.sampler, config.density_measure, batch.jitter)
     plan, chosen, count = present_samples(impostor, plan, config)
     chosen, features, count = visible_samples(impostor, plan, chosen, count, config, None)
+    disordered = jnp.any(segments.disordered)
+    chosen, features = _by_segment(plan.owners, chosen, features, count, disordered)
     samples, owners = place_samples(plan, chosen, count), plan.owners[chosen]
     sigmas = sample_densities(impostor, samples.tet_ids, features, count)
     depths = jnp.where(jnp.arange(owners.size) < count, sigmas * samples.deltas, 0)
@@ -71,13 +74,50 @@ def gather_by_tet(
     num_segments = segments.rays.size
     sums = sum_by_ray(sample_weights(depths, owners, count), values, owners, num_segments, count)
     by_tet = jax.ops.segment_sum(depths, owners, num_segments, indices_are_sorted=True)
-    fits = ~(segments.overflow | samples.overflow)[segments.rays]
-    light = jnp.where((segments.tet_ids >= 0) & fits, transmittance(by_tet, segments.rays), 0)
+    lost = segments.overflow | samples.overflow
+    reached = (segments.tet_ids >= 0) & ~lost[segments.rays]
+    light = jnp.where(reached, _light(by_tet, segments, disordered), 0)
     opacity = sums[:, -2]
     means = sums / jnp.where(opacity > 0, opacity, 1)[:, None]
     return Gathered(
-        segments=segments, light=light, opacity=opacity, share=means[:, -1], features=means[:, :-2]
+        segments=segments,
+        light=light,
+        opacity=opacity,
+        share=means[:, -1],
+        features=means[:, :-2],
+        lost=jnp.sum(lost, dtype=jnp.int32),
     )
+
+
+def _by_segment(
+    owners: Int[Array, " M"],
+    chosen: Int[Array, " M"],
+    features: Float[Array, "M C"],
+    count: Int[Array, ""],
+    disordered: Bool[Array, ""],
+) -> tuple[Int[Array, " M"], Float[Array, "M C"]]:
+    """Samples segment by segment, as they are but where tets overlap: sums within tets ask for that."""
+    order = jnp.arange(chosen.size, dtype=jnp.int32)
+
+    def sort() -> tuple[Int[Array, " M"], Float[Array, "M C"]]:
+        keys = jnp.where(order < count, owners[chosen], jnp.iinfo(owners.dtype).max)
+        places = jax.lax.sort((keys, order), num_keys=1)[1]
+        return chosen[places], features[places]
+
+    return jax.lax.cond(disordered, sort, lambda: (chosen, features))
+
+
+def _light(
+    optical_depth: Float[Array, " N"], segments: TetSegments, disordered: Bool[Array, ""]
+) -> Float[Array, " N"]:
+    """Light that reaches each segment; where tets overlap, they count as in the order of their beginnings."""
+    order = jnp.arange(optical_depth.size, dtype=jnp.int32)
+
+    def sorted_light() -> Float[Array, " N"]:
+        rays, _, places = jax.lax.sort((segments.rays, segments.t_enter, order), num_keys=2)
+        return jnp.zeros_like(optical_depth).at[places].set(transmittance(optical_depth[places], rays))
+
+    return jax.lax.cond(disordered, sorted_light, lambda: transmittance(optical_depth, segments.rays))
 
 
 def _through(layers: list, part: tuple) -> Float[Array, "chunk K"]:
@@ -91,13 +131,14 @@ class Seen:
     light: Float[Array, " U"]  # that reaches each tet
     taken: Float[Array, " U"]  # by it
     products: Float[Array, "D C C"]  # of what tets show, features with features, by decoder set
+    lost: Int[Array, ""]  # rays that did not fit into the buffers
 
 
 def nothing_seen(impostor: NeuralImpostor) -> Seen:
     """Before the first ray."""
     by_tet, features = jnp.zeros(len(impostor.mesh.tets)), impostor.config.encoding.feature_dim
     products = jnp.zeros((num_decoder_sets(impostor.decoders), features, features))
-    return Seen(light=by_tet, taken=by_tet, products=products)
+    return Seen(light=by_tet, taken=by_tet, products=products, lost=jnp.zeros((), jnp.int32))
 
 
 def add_seen(seen: Seen, impostor: NeuralImpostor, batch: RayBatch, config: RenderConfig) -> Seen:
@@ -111,6 +152,7 @@ def add_seen(seen: Seen, impostor: NeuralImpostor, batch: RayBatch, config: Rend
         light=seen.light.at[tets].add(gathered.light),
         taken=seen.taken.at[tets].add(taken),
         products=seen.products + jnp.einsum("dn,nc,nk->dck", mine * taken, features, features),
+        lost=seen.lost + gathered.lost,
     )
 
 
@@ -120,12 +162,15 @@ class Moments:
 
     products: Float[Array, "texels 4 4"]  # of basis functions
     sums: Float[Array, "texels 4 channels"]  # of basis functions and channels
+    lost: Int[Array, ""]  # rays that did not fit into the buffers
 
 
 def no_moments(num_texels: int, num_channels: int) -> Moments:
     """Before the first ray."""
     return Moments(
-        products=jnp.zeros((num_texels, BASIS, BASIS)), sums=jnp.zeros((num_texels, BASIS, num_channels))
+        products=jnp.zeros((num_texels, BASIS, BASIS)),
+        sums=jnp.zeros((num_texels, BASIS, num_channels)),
+        lost=jnp.zeros((), jnp.int32),
     )
 
 
@@ -138,8 +183,8 @@ def add_depths(
 ) -> Moments:
     """Add where on their way through the tets a batch of rays sees something, by the point of entry."""
     gathered = gather_by_tet(impostor, batch, config)
-    segments, mass = gathered.segments, gathered.light * gathered.opacity
-    return _add(moments, layout, segments, segments.lambda_enter, mass, gathered.share[:, None])
+    mass = gathered.light * gathered.opacity
+    return _add(moments, layout, gathered, gathered.segments.lambda_enter, mass, gathered.share[:, None])
 
 
 def add_contents(
@@ -156,7 +201,7 @@ def add_contents(
     used = dataclasses.replace(segments, tet_ids=jnp.maximum(segments.tet_ids, 0))
     places, _ = places_seen(depths, used, jnp.int32(segments.rays.size))
     layout: FaceLayout = depths.layout  # type: ignore[assignment]
-    add = partial(_add, layout=layout, segments=segments, places=places)
+    add = partial(_add, layout=layout, gathered=gathered, places=places)
     mass = gathered.light
     return (
         add(moments[0], mass=mass, channels=gathered.opacity[:, None]),
@@ -167,11 +212,12 @@ def add_contents(
 def _add(
     moments: Moments,
     layout: FaceLayout,
-    segments: TetSegments,
+    gathered: Gathered,
     places: Float[Array, "N 4"],
     mass: Float[Array, " N"],
     channels: Float[Array, "N channels"],
 ) -> Moments:
+    segments = gathered.segments
     tet_ids = jnp.maximum(segments.tet_ids, 0)
     grid, level = FaceGrid(ONE_LEVEL, layout), jnp.int32(0)
     points = grid.prepare(tet_ids, places)
@@ -182,7 +228,7 @@ def _add(
         weighted = (weight * mass)[:, None] * basis
         products = products.at[entries].add(weighted[:, :, None] * basis[:, None, :])
         sums = sums.at[entries].add(weighted[:, :, None] * channels[:, None, :])
-    return Moments(products=products, sums=sums)
+    return Moments(products=products, sums=sums, lost=moments.lost + gathered.lost)
 
 
 def solve_moments(
