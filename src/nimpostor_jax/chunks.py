@@ -116,6 +116,11 @@ def pack_where(
     return jnp.minimum(indices[:num_items], num_items - 1), count
 
 
+def rows_of(arrays: Any, indices: Int[Array, " n"]) -> Any:
+    """Rows [n, ...] of arrays [M, ...]; as `map_used` wants its functions."""
+    return jax.tree.map(lambda x: x[indices], arrays)
+
+
 def map_used(
     function: Callable[[Any, Any], Any],
     shared: Any,

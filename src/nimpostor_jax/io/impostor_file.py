@@ -101,7 +101,8 @@ def _load(path: str | Path, cls: type[Impostor]) -> Impostor:
         config = from_dict(ImpostorConfig, header["config"])
         impostor = _unpack(header["structure"], stored, config)
     except (LookupError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} cannot be read as an impostor: {error}") from error
+        remedy = "if an earlier version wrote it, train or bake again"
+        raise ValueError(f"{path} cannot be read as an impostor: {error}; {remedy}") from error
     if not isinstance(impostor, cls):
         raise ValueError(f"{path} holds a {type(impostor).__name__}, not a {cls.__name__}")
     return impostor

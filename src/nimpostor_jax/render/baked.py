@@ -12,9 +12,9 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
-from nimpostor_jax.chunks import map_used, pack_where
+from nimpostor_jax.chunks import map_used, pack_where, rows_of
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.encoding.face_grid import ONE_LEVEL, face_of
 from nimpostor_jax.encoding.hash_grid import encode
@@ -64,10 +64,11 @@ def shade_segments(
     order = _along_rays(segments, jax.lax.stop_gradient(t), num_used)
     optical_depth = -jnp.log1p(-opacity[order])
     weights = sample_weights(optical_depth, segments.rays, num_used)
-    visible, num_visible = pack_where(_at_least, config.min_weight, jax.lax.stop_gradient(weights), num_used)
+    least, frozen = config.min_weight, jax.lax.stop_gradient(weights)
+    visible, num_visible = pack_where(lambda _, weight: weight >= least, None, frozen, num_used)
     columns = (segments.tet_ids, segments.rays, segments.lambda_exit, places, t)
-    seen, weights = map_used(_rows, (order, weights), visible, num_visible)
-    tet_ids, owners, lambda_exit, places, t = map_used(_rows, columns, seen, num_visible)
+    seen, weights = map_used(rows_of, (order, weights), visible, num_visible)
+    tet_ids, owners, lambda_exit, places, t = map_used(rows_of, columns, seen, num_visible)
     texels = encode(baked.textures, ONE_LEVEL, tet_ids, places, num_visible)
     channels = map_used(_channels, (), (texels, lambda_exit, t), num_visible)
 
@@ -90,14 +91,6 @@ def _along_rays(
         return jax.lax.sort((rays, t, order), num_keys=2)[2]
 
     return jax.lax.cond(jnp.any(segments.disordered), sort, lambda: order)
-
-
-def _at_least(least: Float[Array, ""] | float, weights: Float[Array, " chunk"]) -> Bool[Array, " chunk"]:
-    return weights >= least
-
-
-def _rows(columns: tuple, indices: Int[Array, " chunk"]) -> tuple:
-    return tuple(column[indices] for column in columns)
 
 
 def places_seen(

@@ -36,8 +36,8 @@ def rasterize_frame(baked: BakedImpostor, camera: Camera, config: RenderConfig) 
     """Render one camera by rasterization; with a config of `frame_config`, `render_frame`'s picture.
 
     Of that only the march's sizes, `near` and `min_weight` matter. Tiles with pixels that see more tets than
-    there are layers are done again with more. Raises ValueError where a vertex is not in front of the camera,
-    RuntimeError where 2**6 times the given sizes do not suffice.
+    there are layers are done again with more. Raises ValueError where a tet's vertex is not in front of the
+    camera, RuntimeError where 2**6 times the given sizes do not suffice.
     """
     screen, depth = _to_screen(baked.mesh, camera)
     used = np.unique(np.asarray(baked.mesh.tets))

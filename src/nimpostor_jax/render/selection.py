@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import default_chunk, map_used, pack_where, padded_size
+from nimpostor_jax.chunks import default_chunk, map_used, pack_where, padded_size, rows_of
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import CLOSED, MIXED, OPEN, is_kept
@@ -165,7 +165,7 @@ def visible_samples(
     if refinement is not None:
         weights *= refinement[samples.rays]
     visible, num_visible = pack_where(lambda _, weight: weight >= least, None, weights, num_used)
-    chosen, features = map_used(_rows, (chosen, features), visible, num_visible)
+    chosen, features = map_used(rows_of, (chosen, features), visible, num_visible)
     return chosen, features, num_visible
 
 
@@ -186,7 +186,3 @@ def _density(decoders: NeuralImpostor, part: tuple) -> Float[Array, " chunk"]:
 def optical_weights(sigmas: Float[Array, " M"], samples: Samples) -> Float[Array, " M"]:
     """Share of its ray's light that each packed sample contributes."""
     return sample_weights(sigmas * samples.deltas, samples.rays, samples.num_used)
-
-
-def _rows(arrays: Any, indices: Int[Array, " M"]) -> Any:
-    return jax.tree.map(lambda x: x[indices], arrays)

@@ -1,6 +1,6 @@
 """Adam for tables of which a batch touches few rows: the others are not read and do not move.
 
-Kingma and Ba (2015), with Instant-NGP's constants as `train.step.make_optimizer`. Moments of a row decay with
+Kingma and Ba (2015), with the constants of `train.step.make_optimizer`. Moments of a row decay with
 the steps that touch it, as in PyTorch's SparseAdam. Axes: N rows, F numbers each.
 """
 
@@ -9,8 +9,7 @@ from flax import struct
 from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.chunks import default_chunk, for_chunks, packed_indices, padded_size, take
-
-B1, B2, EPSILON = 0.9, 0.99, 1e-15
+from nimpostor_jax.train.step import B1, B2, EPSILON
 
 
 @struct.dataclass

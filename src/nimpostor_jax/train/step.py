@@ -23,6 +23,7 @@ from nimpostor_jax.types import NeuralImpostor, Rays
 Parameters = dict[str, Any]
 Metrics = dict[str, Array]
 
+B1, B2, EPSILON = 0.9, 0.99, 1e-15  # Adam's, as Instant-NGP has them
 DECAY = 0.95  # of a cell's optical thickness between updates
 MIN_THICKNESS = 0.01  # of a step, below which a cell counts as empty
 NEVER = -(1 << 30)  # step of a cell that no ray has seen
@@ -65,8 +66,8 @@ def with_parameters(impostor: NeuralImpostor, parameters: Parameters) -> NeuralI
 
 
 def make_optimizer() -> optax.GradientTransformation:
-    """Adam's direction (Instant-NGP's constants); the step applies the learning rate."""
-    return optax.scale_by_adam(b1=0.9, b2=0.99, eps=1e-15)
+    """Adam's direction; the step applies the learning rate."""
+    return optax.scale_by_adam(b1=B1, b2=B2, eps=EPSILON)
 
 
 def learning_rate(config: TrainConfig, progress: float, step: int) -> float:
