@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes_baked import baked
 
 from nimpostor_jax.config import EncodingConfig, ImpostorConfig
 from nimpostor_jax.edit.deform import bend, deform, deformation_report, rigid, stretch, twist
@@ -110,3 +111,15 @@ def test_errors_name_the_vertex(impostor):
         deform(impostor, bend(1.0))
     with pytest.raises(ValueError, match="c must not be 0"):
         bend(0.0)
+
+
+def test_a_baked_impostor_moves_as_one_that_is_not():
+    made = baked()
+    moved = deform(made, twist(0.9))
+    assert type(moved) is type(made)
+    world = world_vertices(made.mesh)
+    np.testing.assert_allclose(
+        world_vertices(moved.mesh), np.stack(expected("twist", *world.T), axis=1), atol=1e-5
+    )  # float32, at a world size of a few units
+    assert moved.textures is made.textures and moved.depths is made.depths
+    assert deformation_report(moved).num_tets == len(made.mesh.tets)

@@ -7,6 +7,7 @@ deformed reference scenes (world coordinates, z up).
 
 import dataclasses
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +15,15 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from nimpostor_jax.geometry.tetrahedron import corners, cross, signed_volumes
-from nimpostor_jax.types import NeuralImpostor
+from nimpostor_jax.types import BakedImpostor, NeuralImpostor
 
+Deformable = TypeVar("Deformable", NeuralImpostor, BakedImpostor)
 SpaceMap = Callable[[Float[Array, "V 3"]], Float[Array, "V 3"]]
 Scalar = Float[Array, ""] | float
 
 
-def deform(impostor: NeuralImpostor, space_map: SpaceMap) -> NeuralImpostor:
-    """The impostor with its vertices moved by `space_map`, a function of world points [V, 3].
+def deform(impostor: Deformable, space_map: SpaceMap) -> Deformable:
+    """The impostor, baked or not, with its vertices moved by `space_map`, a function of world points [V, 3].
 
     The map may use jnp (then this works under jit and grad, also with respect to the map's
     parameters) or NumPy (it is given a read-only array). The mesh keeps its frame, also where
@@ -52,17 +54,20 @@ def deform(impostor: NeuralImpostor, space_map: SpaceMap) -> NeuralImpostor:
     return with_vertices(impostor, mesh.vertices + (jnp.asarray(moved, world.dtype) - world) / mesh.scale)
 
 
-def with_vertices(impostor: NeuralImpostor, vertices: Float[Array, "V 3"]) -> NeuralImpostor:
+def with_vertices(impostor: Deformable, vertices: Float[Array, "V 3"]) -> Deformable:
     """The impostor with its vertices, in the mesh's frame, elsewhere; remembers where they were at rest.
 
     Outside jit, one that was at rest and of which none moves is given back as it is: it has not turned, and
-    renders by the same program to the same bits, with `directions` "rest" too.
+    renders by the same program to the same bits, with `directions` "rest" too. Baked ones remember nothing:
+    they are seen from directions in the world.
     """
+    mesh = dataclasses.replace(impostor.mesh, vertices=vertices)
+    if isinstance(impostor, BakedImpostor):
+        return dataclasses.replace(impostor, mesh=mesh)
     known = not any(isinstance(x, jax.core.Tracer) for x in (vertices, impostor.mesh.vertices))
     if known and impostor.rest_vertices is None and np.array_equal(vertices, impostor.mesh.vertices):
         return impostor
     rest = impostor.mesh.vertices if impostor.rest_vertices is None else impostor.rest_vertices
-    mesh = dataclasses.replace(impostor.mesh, vertices=vertices)
     return dataclasses.replace(impostor, mesh=mesh, rest_vertices=rest)
 
 
@@ -80,7 +85,7 @@ class DeformationReport:
         return len(self.inverted)
 
 
-def deformation_report(impostor: NeuralImpostor) -> DeformationReport:
+def deformation_report(impostor: NeuralImpostor | BakedImpostor) -> DeformationReport:
     """Which tets of the cage have been turned inside out or flattened. Host code."""
     mesh = impostor.mesh
     volumes = np.asarray(signed_volumes(corners(mesh.vertices, mesh.tets)), np.float64)
