@@ -55,7 +55,8 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
-    scene = prepare(config, args.data, cage=args.workdir / "cage.npz", log=lambda _: None)
+    saved = args.workdir / "cage.npz"  # the ladder's boxes are not saved, but made again
+    scene = prepare(config, args.data, cage=saved if saved.exists() else None, log=lambda _: None)
     camera = first_camera(scene, FRAME_SIZE)
     order = tile_order(camera.height, camera.width)
     rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2)[order])

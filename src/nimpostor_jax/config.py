@@ -361,7 +361,7 @@ class RetrainConfig:
 
     feature_steps: int = 100
     points_per_batch: int = 1 << 16  # of a step; four times as many at once for the start
-    render_steps: int = 250
+    render_steps: int = 120
     rays_per_batch: int = 4096
     views: int = 24  # pictures of the old impostor, from all around the region, that stage 2 trains on
     view_width: int = 200

@@ -20,13 +20,17 @@ from nimpostor_jax.edit.region import Region, trained_part, with_region, with_tr
 from nimpostor_jax.edit.remesh import consolidate, overlay, transfer
 from nimpostor_jax.edit.retrain import fit_features
 from nimpostor_jax.edit.subdivide import subdivide
+from nimpostor_jax.edit.visibility import add_seen
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import to_cells
 from nimpostor_jax.geometry.locate import locate_tables
-from nimpostor_jax.geometry.topology import world_vertices
+from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
+from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
 from nimpostor_jax.render.camera import image_pixels, pixel_rays
-from nimpostor_jax.render.occupancy import in_occupied_cells, num_cells
-from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.occupancy import cell_index, in_occupied_cells, num_cells
+from nimpostor_jax.render.renderer import render_rays, render_samples
+from nimpostor_jax.render.selection import optical_weights
+from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import FunctionSolid
 
 CONFIG = dataclasses.replace(
@@ -239,3 +243,59 @@ def test_bad_input():
         transfer(live, vertices, tets, CONFIG, QUICK, quiet)
     with pytest.raises(ValueError, match="hides everything"):
         consolidate(live, CONFIG, QUICK, quiet)
+
+
+def test_what_is_seen_of_each_part_adds_up():
+    """The same tets in another order, and not all in the region: weights go to the parts that they lie in."""
+    made = scenes.impostor("delaunay")
+    count = len(made.mesh.tets)
+    made = dataclasses.replace(made, occupied=jnp.ones((count, num_cells(3)), bool))
+    order = np.random.default_rng(0).permutation(count)
+    mesh = build_in_frame(made.mesh, np.asarray(made.mesh.vertices), np.asarray(made.mesh.tets)[order])
+    inside = np.arange(count) % 3 > 0
+    nothing = jnp.arange(0)
+    region = Region(tets=jnp.asarray(np.flatnonzero(inside)), entries=nothing, decoder_sets=nothing)
+    camera = scenes.camera(16, 16)
+    rays = pixel_rays(camera, image_pixels(16, 16).reshape(-1, 2))
+    output, samples = render_samples(made, rays, CONFIG)
+    features = field.features(made, samples.tet_ids, samples.lambdas)
+    sigmas = field.density(made, samples.tet_ids, features)
+    weights = np.asarray(optical_weights(sigmas, samples))
+    expected = np.zeros((count, num_cells(3)))
+    parts = np.asarray(cell_index(jnp.zeros_like(samples.tet_ids), samples.lambdas, num_cells(3)))
+    np.add.at(expected, (np.argsort(order)[np.asarray(samples.tet_ids)], parts), weights)
+    assert_allclose(expected.sum(), np.sum(output.opacity), rtol=1e-5)
+    batch = RayBatch(rays=rays, target=None, background=None, jitter=None)
+    numbers = np.full(count, inside.sum())
+    numbers[inside] = np.arange(inside.sum())
+    none = jnp.zeros((inside.sum(), num_cells(3)))
+    found = add_seen(none, made, mesh, locate_tables(mesh), jnp.asarray(numbers), batch, CONFIG)
+    # a sample within rounding of a part's side may count on the other
+    off = np.abs(found - expected[inside])
+    assert np.sum(off) < 0.01 * np.sum(expected) and np.median(off) < 1e-6
+    # points then follow what is seen
+    new = dataclasses.replace(made, mesh=mesh)
+    region = dataclasses.replace(region, seen=found)
+    points = draw_points(
+        jax.random.key(0), made, locate_tables(made.mesh), new, region, count=20_000, measure="barycentric"
+    )
+    share = np.bincount(np.asarray(points.tets), minlength=count)[inside] / 20_000
+    volumes = signed_volumes(corners(mesh.vertices, mesh.tets))[inside]
+    target = 0.8 * found.sum(axis=1) / found.sum() + 0.2 * volumes / volumes.sum()
+    assert_allclose(share, target, atol=0.01)  # three standard deviations of 20,000 draws
+
+
+@pytest.mark.parametrize("seen", [None, 0.0])
+def test_points_are_spread_evenly_where_nothing_is_seen(seen):
+    made = scenes.impostor("cube")
+    count = len(made.mesh.tets)
+    made = dataclasses.replace(made, occupied=jnp.ones((count, num_cells(2)), bool))
+    region = Region(tets=jnp.arange(count), entries=jnp.arange(0), decoder_sets=jnp.arange(0))
+    if seen is not None:
+        region = dataclasses.replace(region, seen=jnp.full((count, num_cells(2)), seen))
+    points = draw_points(
+        jax.random.key(0), made, locate_tables(made.mesh), made, region, count=20_000, measure="barycentric"
+    )
+    share = np.bincount(np.asarray(points.tets), minlength=count) / 20_000
+    volumes = np.asarray(signed_volumes(corners(made.mesh.vertices, made.mesh.tets)))
+    assert_allclose(share, volumes / volumes.sum(), atol=0.011)  # three standard deviations

@@ -19,6 +19,7 @@ from nimpostor_jax.render.occupancy import in_occupied_cells, random_points
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
 EMPTY_SHARE = 0.1  # of the points in occupied parts, as many in others of the same volume
+SEEN_SHARE = 0.8  # of the points that go where something is seen
 OCCUPANCY_POINTS = 16  # in each part of a new cell, to find out what is occupied
 INWARD = 1e-3  # of the way to the tet's middle
 
@@ -48,7 +49,8 @@ def draw_points(
 ) -> Points:
     """Points in the region's tets, and what the old field has there (Eq. 12, stage 1).
 
-    Even over the volume; where occupancy is known, ten times as dense in occupied parts. `measure` is that of
+    Most lie where something is seen, as far as that is known (`visibility.seen_parts`), the others even over
+    the volume; where occupancy is known, ten times as dense in occupied parts. `measure` is that of
     densities: barycentric ones change with the size of tets.
     """
     point_key, side_key = jax.random.split(key)
@@ -104,8 +106,13 @@ def _random_places(
         shares = jax.random.exponential(place_key, (count, 4), volumes.dtype)
         return chosen, shares / jnp.sum(shares, axis=1, keepdims=True)
     occupied = new.occupied[_cells_of_region(new, region)]
-    weights = (volumes[:, None] * jnp.where(occupied, 1.0, EMPTY_SHARE)).reshape(-1)
-    parts = jax.random.choice(choice_key, weights.size, (count,), p=weights / jnp.sum(weights))
+    weights = volumes[:, None] * jnp.where(occupied, 1.0, EMPTY_SHARE)
+    weights /= jnp.sum(weights)
+    if region.seen is not None:
+        total = jnp.sum(region.seen)
+        share = jnp.where(total > 0, SEEN_SHARE / jnp.where(total > 0, total, 1), 0)
+        weights = (1 - SEEN_SHARE) * weights + share * region.seen
+    parts = jax.random.choice(choice_key, weights.size, (count,), p=weights.reshape(-1) / jnp.sum(weights))
     chosen, lambdas = random_points(place_key, parts, occupied.shape[1])
     return chosen, lambdas.astype(volumes.dtype)
 

@@ -29,6 +29,7 @@ class Region:
     entries: Int[Array, " m"]  # of the tables
     decoder_sets: Int[Array, " d"]
     sources: Int[Array, " n"] | None = None  # tets of the old mesh that are the same; None: there are none
+    seen: Float[Array, "n parts"] | None = None  # how much is seen of each part of the tets, where known
 
 
 def with_region(

@@ -1,9 +1,10 @@
 """Two-stage local retraining (Sec. 4.2, Eq. 12): a region of a new impostor learns what an old one shows.
 
 Tables start from some updates towards the old features (`fit_features`). Stage 1 fits tables and decoders of
-the region to the old field at random points: its features, and what they are decoded to; stage 2 to pictures
-of the old impostor, along rays that cross the region. Steps are pure, (state, batch) to (state, loss);
-everything outside the region keeps its bits (`region.py`).
+the region to the old field at random points, most of them where something is seen (`visibility.py`): its
+features, and what they are decoded to; stage 2 to pictures of the old impostor, along rays that cross the
+region. Steps are pure, (state, batch) to (state, loss); everything outside the region keeps its bits
+(`region.py`).
 
 Axes: M points, R rays, C features.
 """
@@ -28,6 +29,7 @@ from nimpostor_jax.edit.boolean import STEP
 from nimpostor_jax.edit.probe import Points, draw_points, occupancy_of
 from nimpostor_jax.edit.region import Region, entries_of, trained_part, with_trained_part
 from nimpostor_jax.edit.teacher import pictures_of
+from nimpostor_jax.edit.visibility import seen_parts
 from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import to_cells
@@ -35,7 +37,7 @@ from nimpostor_jax.geometry.locate import LocateTables, locate_tables
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
-from nimpostor_jax.train.pool import draw_batch
+from nimpostor_jax.train.pool import PixelPool, draw_batch
 from nimpostor_jax.train.sharding import AXIS, data_parallel, device_mesh, over_rays, replicated
 from nimpostor_jax.train.step import (
     Metrics,
@@ -50,6 +52,7 @@ from nimpostor_jax.types import NeuralImpostor
 FEATURE_WEIGHT = 0.1  # of features, where opacities and colours count 1
 START_UPDATES = 8  # of tables, before stage 1
 START_BATCHES = 4  # of points, together in an update
+WARMUP_STEPS = 30  # of stage 2: Adam's first steps, of few gradients, would undo what stage 1 has found
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
 SYNC_EVERY = 8  # steps that may be under way at once
@@ -82,6 +85,8 @@ def retrain(
     source = locate_tables(old.mesh)
     draw = jax.jit(partial(draw_points, measure=render.density_measure), static_argnames="count")
     new = dataclasses.replace(new, occupied=occupancy_of(old, source, new, region, config))
+    pool = pictures_of(old, new, region, render, config)
+    region = dataclasses.replace(region, seen=seen_parts(old, new, region, pool, render, config))
     for i in range(START_UPDATES):
         several = START_BATCHES * config.points_per_batch
         points = draw(jax.random.fold_in(key, i), old, source, new, region, count=several)
@@ -90,7 +95,7 @@ def retrain(
     rates = {"features": config.feature_rate, "decoders": config.decoder_rate}
     state, losses = _feature_stage(old, source, new, region, draw, config, state, optimizer, rates)
     _log_stage(log, "features", losses)
-    state, losses = _render_stage(old, new, region, render, config, state, optimizer, rates)
+    state, losses = _render_stage(pool, new, region, render, config, state, optimizer, rates)
     _log_stage(log, "colours", losses)
     return with_trained_part(new, region, state.part)
 
@@ -124,7 +129,7 @@ def _feature_stage(
 
 
 def _render_stage(
-    old: NeuralImpostor,
+    pool: PixelPool,
     new: NeuralImpostor,
     region: Region,
     render: RenderConfig,
@@ -136,7 +141,7 @@ def _render_stage(
     """Stage 2, its rays split over all local devices."""
     if not config.render_steps:
         return state, []
-    pool, key, losses = pictures_of(old, new, region, render, config), jax.random.key(config.seed + 1), []
+    key, losses = jax.random.key(config.seed + 1), []
     probe = draw_batch(key, 0, pool, min(PROBE_RAYS, config.rays_per_batch), "random")
     march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.holds.shape[1])
     sized = dataclasses.replace(render, march=march)
@@ -152,7 +157,7 @@ def _render_stage(
     state = dataclasses.replace(state, optimizer=optimizer.init(state.part))
     for i in tqdm(range(config.render_steps), desc="colours", unit="step", disable=None):
         batch = place(draw_batch(key, i, pool, config.rays_per_batch, "random"))
-        share = FINAL_RATE ** (i / config.render_steps)
+        share = min(1, (i + 1) / (WARMUP_STEPS + 1)) * FINAL_RATE ** (i / config.render_steps)
         scaled = {name: share * rate for name, rate in rates.items()}
         state, loss = compiled(state, new, region, batch, scaled)
         losses.append(loss)
