@@ -361,11 +361,11 @@ class RetrainConfig:
 
     feature_steps: int = 100
     points_per_batch: int = 1 << 16  # of a step; four times as many at once for the start
-    render_steps: int = 120
+    render_steps: int = 100
     rays_per_batch: int = 4096
     views: int = 24  # pictures of the old impostor, from all around the region, that stage 2 trains on
     view_width: int = 200
-    feature_rate: float = 1e-2  # of both stages' tables; falls to a tenth in the second
+    feature_rate: float = 1e-2  # of both stages' tables; in the second it rises first, and falls to a tenth
     decoder_rate: float = 2e-3
     max_lost_share: float = 0.001
     seed: int = 0

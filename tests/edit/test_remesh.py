@@ -13,6 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from nimpostor_jax.config import RetrainConfig
+from nimpostor_jax.edit import visibility
 from nimpostor_jax.edit.boolean import gated, union
 from nimpostor_jax.edit.deform import deform, rigid, stretch
 from nimpostor_jax.edit.probe import draw_points, occupancy_of
@@ -20,7 +21,8 @@ from nimpostor_jax.edit.region import Region, trained_part, with_region, with_tr
 from nimpostor_jax.edit.remesh import consolidate, overlay, transfer
 from nimpostor_jax.edit.retrain import fit_features
 from nimpostor_jax.edit.subdivide import subdivide
-from nimpostor_jax.edit.visibility import add_seen
+from nimpostor_jax.edit.teacher import pictures_of
+from nimpostor_jax.edit.visibility import NewMesh, add_seen, seen_parts
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import to_cells
 from nimpostor_jax.geometry.locate import locate_tables
@@ -30,6 +32,7 @@ from nimpostor_jax.render.camera import image_pixels, pixel_rays
 from nimpostor_jax.render.occupancy import cell_index, in_occupied_cells, num_cells
 from nimpostor_jax.render.renderer import render_rays, render_samples
 from nimpostor_jax.render.selection import optical_weights
+from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import FunctionSolid
 
@@ -245,44 +248,67 @@ def test_bad_input():
         consolidate(live, CONFIG, QUICK, quiet)
 
 
-def test_what_is_seen_of_each_part_adds_up():
-    """The same tets in another order, and not all in the region: weights go to the parts that they lie in."""
-    made = scenes.impostor("delaunay")
-    count = len(made.mesh.tets)
-    made = dataclasses.replace(made, occupied=jnp.ones((count, num_cells(3)), bool))
-    order = np.random.default_rng(0).permutation(count)
-    mesh = build_in_frame(made.mesh, np.asarray(made.mesh.vertices), np.asarray(made.mesh.tets)[order])
-    inside = np.arange(count) % 3 > 0
-    nothing = jnp.arange(0)
-    region = Region(tets=jnp.asarray(np.flatnonzero(inside)), entries=nothing, decoder_sets=nothing)
-    camera = scenes.camera(16, 16)
-    rays = pixel_rays(camera, image_pixels(16, 16).reshape(-1, 2))
+def weights_by_part(made, rays, parts):
+    """The weights of samples in the tets and parts where they lie, by a loop of NumPy's, and their sum."""
     output, samples = render_samples(made, rays, CONFIG)
     features = field.features(made, samples.tet_ids, samples.lambdas)
-    sigmas = field.density(made, samples.tet_ids, features)
-    weights = np.asarray(optical_weights(sigmas, samples))
-    expected = np.zeros((count, num_cells(3)))
-    parts = np.asarray(cell_index(jnp.zeros_like(samples.tet_ids), samples.lambdas, num_cells(3)))
-    np.add.at(expected, (np.argsort(order)[np.asarray(samples.tet_ids)], parts), weights)
-    assert_allclose(expected.sum(), np.sum(output.opacity), rtol=1e-5)
+    weights = optical_weights(field.density(made, samples.tet_ids, features), samples)
+    found = np.zeros((len(made.mesh.tets), parts))
+    places = np.asarray(cell_index(jnp.zeros_like(samples.tet_ids), samples.lambdas, parts))
+    np.add.at(found, (np.asarray(samples.tet_ids), places), np.asarray(weights))
+    assert_allclose(found.sum(), np.sum(output.opacity), rtol=1e-5)
+    return found
+
+
+@pytest.mark.parametrize("overlapping", [False, True])
+def test_what_is_seen_adds_up_in_the_parts(overlapping):
+    """Tets in another order, or overlapping ones whose places are known; some of them in the region."""
+    made, parts = scenes.impostor("blobs" if overlapping else "delaunay"), num_cells(3)
+    made = scenes.pushed_together(made) if overlapping else made
+    count = len(made.mesh.tets)
+    order = np.random.default_rng(0).permutation(count)
+    mesh = build_in_frame(made.mesh, np.asarray(made.mesh.vertices), np.asarray(made.mesh.tets)[order])
+    rays = pixel_rays(scenes.camera(16, 16), image_pixels(16, 16).reshape(-1, 2))
+    expected = weights_by_part(made, rays, parts)
+    inside = np.arange(count) % 3 > 0
+    rows = np.full(count, inside.sum())
+    rows[inside] = np.arange(inside.sum())
+    target = None if overlapping else NewMesh(mesh, locate_tables(mesh))
+    expected = (expected if overlapping else expected[order])[inside]
     batch = RayBatch(rays=rays, target=None, background=None, jitter=None)
-    numbers = np.full(count, inside.sum())
-    numbers[inside] = np.arange(inside.sum())
-    none = jnp.zeros((inside.sum(), num_cells(3)))
-    found = add_seen(none, made, mesh, locate_tables(mesh), jnp.asarray(numbers), batch, CONFIG)
+    found = add_seen(jnp.zeros_like(expected), made, target, jnp.asarray(rows), batch, CONFIG)
     # a sample within rounding of a part's side may count on the other
-    off = np.abs(found - expected[inside])
+    off = np.abs(found - expected)
     assert np.sum(off) < 0.01 * np.sum(expected) and np.median(off) < 1e-6
-    # points then follow what is seen
-    new = dataclasses.replace(made, mesh=mesh)
-    region = dataclasses.replace(region, seen=found)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_points_follow_what_is_seen(monkeypatch, known):
+    """From the pool's rays, on all devices, to the parts in which points are drawn."""
+    monkeypatch.setattr(visibility, "RAYS", 2048)
+    made, parts = scenes.impostor("delaunay"), num_cells(2)
+    count = len(made.mesh.tets)
+    made = dataclasses.replace(made, occupied=jnp.ones((count, parts), bool))
+    eye = np.broadcast_to(np.eye(4), (count, 4, 4))
+    new, region = with_region(made, made.mesh, np.full(count, -1), eye, np.arange(count))
+    if known:
+        region = dataclasses.replace(region, sources=jnp.arange(count))
+    pool = pictures_of(made, new, region, CONFIG, QUICK)
+    seen = seen_parts(made, new, region, pool, CONFIG, QUICK)
+    rays = [draw_batch(jax.random.key(QUICK.seed + 3), i, pool, 512, "random").rays for i in range(4)]
+    expected = weights_by_part(made, jax.tree.map(lambda *x: jnp.concatenate(x), *rays), parts)
+    # with jitter or without, the same rays see the same tets: but for where steps begin
+    assert_allclose(np.sum(seen, axis=1), expected.sum(axis=1), atol=0.02 * expected.sum())
+    assert_allclose(np.sum(seen), expected.sum(), rtol=0.02)
+    region, draws = dataclasses.replace(region, seen=seen), 50_000
     points = draw_points(
-        jax.random.key(0), made, locate_tables(made.mesh), new, region, count=20_000, measure="barycentric"
+        jax.random.key(0), made, locate_tables(made.mesh), new, region, count=draws, measure="barycentric"
     )
-    share = np.bincount(np.asarray(points.tets), minlength=count)[inside] / 20_000
-    volumes = signed_volumes(corners(mesh.vertices, mesh.tets))[inside]
-    target = 0.8 * found.sum(axis=1) / found.sum() + 0.2 * volumes / volumes.sum()
-    assert_allclose(share, target, atol=0.01)  # three standard deviations of 20,000 draws
+    drawn = np.bincount(cell_index(points.tets, points.lambdas, parts), minlength=seen.size) / draws
+    volumes = np.asarray(signed_volumes(corners(made.mesh.vertices, made.mesh.tets)))
+    even = np.repeat(volumes / volumes.sum() / parts, parts)
+    target = 0.8 * np.ravel(seen) / np.sum(seen) + 0.2 * even
+    assert_allclose(drawn, target, atol=0.005)  # three standard deviations of 50,000 draws
 
 
 @pytest.mark.parametrize("seen", [None, 0.0])

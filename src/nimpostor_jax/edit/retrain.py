@@ -52,7 +52,7 @@ from nimpostor_jax.types import NeuralImpostor
 FEATURE_WEIGHT = 0.1  # of features, where opacities and colours count 1
 START_UPDATES = 8  # of tables, before stage 1
 START_BATCHES = 4  # of points, together in an update
-WARMUP_STEPS = 30  # of stage 2: Adam's first steps, of few gradients, would undo what stage 1 has found
+WARMUP_STEPS = 30  # of stage 2, at most a quarter: Adam's first steps, of few gradients, would undo stage 1
 FINAL_RATE = 0.1  # of the rates, at the end of stage 2
 PROBE_RAYS = 4096
 SYNC_EVERY = 8  # steps that may be under way at once
@@ -85,8 +85,9 @@ def retrain(
     source = locate_tables(old.mesh)
     draw = jax.jit(partial(draw_points, measure=render.density_measure), static_argnames="count")
     new = dataclasses.replace(new, occupied=occupancy_of(old, source, new, region, config))
-    pool = pictures_of(old, new, region, render, config)
-    region = dataclasses.replace(region, seen=seen_parts(old, new, region, pool, render, config))
+    if config.render_steps or new.occupied is not None:
+        pool = pictures_of(old, new, region, render, config)
+        region = dataclasses.replace(region, seen=seen_parts(old, new, region, pool, render, config))
     for i in range(START_UPDATES):
         several = START_BATCHES * config.points_per_batch
         points = draw(jax.random.fold_in(key, i), old, source, new, region, count=several)
@@ -95,8 +96,9 @@ def retrain(
     rates = {"features": config.feature_rate, "decoders": config.decoder_rate}
     state, losses = _feature_stage(old, source, new, region, draw, config, state, optimizer, rates)
     _log_stage(log, "features", losses)
-    state, losses = _render_stage(pool, new, region, render, config, state, optimizer, rates)
-    _log_stage(log, "colours", losses)
+    if config.render_steps:
+        state, losses = _render_stage(pool, new, region, render, config, state, optimizer, rates)
+        _log_stage(log, "colours", losses)
     return with_trained_part(new, region, state.part)
 
 
@@ -139,8 +141,6 @@ def _render_stage(
     rates: dict[str, float],
 ) -> tuple[RetrainState, list[Array]]:
     """Stage 2, its rays split over all local devices."""
-    if not config.render_steps:
-        return state, []
     key, losses = jax.random.key(config.seed + 1), []
     probe = draw_batch(key, 0, pool, min(PROBE_RAYS, config.rays_per_batch), "random")
     march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.holds.shape[1])
@@ -155,9 +155,10 @@ def _render_stage(
     step = partial(render_step, optimizer=optimizer, config=sized, gradient=gradient)
     compiled = jax.jit(step, donate_argnums=0)
     state = dataclasses.replace(state, optimizer=optimizer.init(state.part))
+    warmup = min(WARMUP_STEPS, config.render_steps // 4)
     for i in tqdm(range(config.render_steps), desc="colours", unit="step", disable=None):
         batch = place(draw_batch(key, i, pool, config.rays_per_batch, "random"))
-        share = min(1, (i + 1) / (WARMUP_STEPS + 1)) * FINAL_RATE ** (i / config.render_steps)
+        share = min(1, (i + 1) / (warmup + 1)) * FINAL_RATE ** (i / config.render_steps)
         scaled = {name: share * rate for name, rate in rates.items()}
         state, loss = compiled(state, new, region, batch, scaled)
         losses.append(loss)

@@ -7,6 +7,8 @@ Axes: n tets of the region, M samples.
 """
 
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +17,9 @@ from jaxtyping import Array, Float, Int
 from nimpostor_jax.config import RenderConfig, RetrainConfig
 from nimpostor_jax.edit.region import Region
 from nimpostor_jax.field import impostor as field
+from nimpostor_jax.geometry.barycentric import barycentric
 from nimpostor_jax.geometry.locate import LocateTables, locate, locate_tables
+from nimpostor_jax.geometry.tetrahedron import corners
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.occupancy import cell_index
@@ -28,6 +32,13 @@ from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
 RAYS = 1 << 16  # that look; a part that none of them sees is not forgotten, but only looked at less
+
+
+class NewMesh(NamedTuple):
+    """Where to look for points of the old one."""
+
+    mesh: TetMesh
+    tables: LocateTables
 
 
 def seen_parts(
@@ -46,19 +57,21 @@ def seen_parts(
     if new.occupied is None:
         return None
     key, size = jax.random.key(config.seed + 3), config.rays_per_batch
-    probe = draw_batch(key, 0, pool, size, "white")
-    sized = fit_capacities(old.mesh, jax.jit(march_tables)(old.mesh), probe.rays, render)
-    numbers = np.full(len(new.mesh.tets), region.tets.size, np.int32)
-    numbers[np.asarray(region.tets)] = np.arange(region.tets.size)
+    sample = draw_batch(key, 0, pool, size, "random")
+    sized = fit_capacities(old.mesh, jax.jit(march_tables)(old.mesh), sample.rays, render)
+    # Where places in the old mesh are known, tets may overlap, and must not be sought.
+    target = None if region.sources is not None else NewMesh(new.mesh, locate_tables(new.mesh))
+    tets = region.tets if region.sources is None else region.sources
+    rows = np.full(len((new if region.sources is None else old).mesh.tets), region.tets.size, np.int32)
+    rows[np.asarray(tets)] = np.arange(region.tets.size)
     devices = jax.local_devices()
     mesh = device_mesh(devices if size % len(devices) == 0 else devices[:1])
-    shared = old, new.mesh, locate_tables(new.mesh), jnp.asarray(numbers)
-    shared = jax.device_put(shared, replicated(mesh))
+    shared = jax.device_put((old, target, jnp.asarray(rows)), replicated(mesh))
     seen = jnp.zeros((mesh.size, region.tets.size, new.occupied.shape[1]), new.mesh.vertices.dtype)
     seen = jax.device_put(seen, over_rays(mesh))
     add = jax.jit(sums_by_device(mesh, add_seen), static_argnames="config", donate_argnums=0)
     for i in range(-(-RAYS // size)):
-        batch = jax.device_put(draw_batch(key, i, pool, size, "white"), over_rays(mesh))
+        batch = jax.device_put(draw_batch(key, i, pool, size, "random"), over_rays(mesh))
         seen = add(seen, *shared, batch, config=sized)
     return jnp.asarray(np.sum(np.asarray(seen), axis=0))
 
@@ -66,23 +79,27 @@ def seen_parts(
 def add_seen(
     seen: Float[Array, "n parts"],
     old: NeuralImpostor,
-    mesh: TetMesh,
-    source: LocateTables,
-    numbers: Int[Array, " T"],
+    target: NewMesh | None,
+    rows: Int[Array, " T"],
     batch: RayBatch,
     config: RenderConfig,
 ) -> Float[Array, "n parts"]:
-    """`seen` and the weights of a batch's samples, in the parts of the new `mesh`'s tets where they lie.
+    """`seen` and the weights of a batch's samples, in the parts of the region's tets where they lie.
 
-    `numbers` are the tets' in the region, n for others. Both meshes have the same frame.
+    These are sought in the `target`, which has the old mesh's frame; without one, they are the old mesh's
+    tets in which the samples are. `rows` are those tets' numbers in the region, n for others.
     """
     _, samples = render_samples(old, batch.rays, config, batch.jitter)
     features = field.features(old, samples.tet_ids, samples.lambdas, samples.num_used)
     sigmas = sample_densities(old, samples.tet_ids, features, samples.num_used)
     weights = optical_weights(sigmas, samples)
-    local = to_local(old.mesh, batch.rays)
+    local, mesh = to_local(old.mesh, batch.rays), old.mesh
     points = local.origins[samples.rays] + samples.t[:, None] * local.directions[samples.rays]
-    tets, lambdas = locate(mesh, old.mesh.center + old.mesh.scale * points, source)
-    rows = jnp.where((tets >= 0) & (samples.deltas > 0), numbers[jnp.maximum(tets, 0)], len(seen))
+    if target is None:
+        tets = samples.tet_ids if samples.mesh_tets is None else samples.mesh_tets
+        lambdas = barycentric(points, corners(mesh.vertices, mesh.tets[tets]))
+    else:
+        tets, lambdas = locate(target.mesh, mesh.center + mesh.scale * points, target.tables)
+    at = jnp.where((tets >= 0) & (samples.deltas > 0), rows[jnp.maximum(tets, 0)], len(seen))
     parts = cell_index(jnp.zeros_like(tets), lambdas, seen.shape[1])
-    return seen.at[rows, parts].add(weights, mode="drop")
+    return seen.at[at, parts].add(weights, mode="drop")
