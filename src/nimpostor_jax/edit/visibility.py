@@ -6,7 +6,6 @@ what the pictures show; points spread evenly over the volume would let it serve 
 Axes: n tets of the region, M samples.
 """
 
-
 from typing import NamedTuple
 
 import jax
