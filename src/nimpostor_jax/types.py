@@ -112,6 +112,7 @@ class FaceLayout:
 
     starts: Int[Array, "T 4"]  # first texel of the face opposite each corner
     resolutions: Int[Array, "T 4"]  # n
+    rows: Int[Array, " texels"] | None = None  # of texels in a table that holds some of them only
 
 
 @struct.dataclass

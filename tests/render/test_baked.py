@@ -1,6 +1,7 @@
 """render.baked and render.rasterize: textures on faces, marched and rasterized."""
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +18,11 @@ from scenes_baked import baked as baked_scene
 
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.geometry.tetrahedron import FACES
-from nimpostor_jax.render.baked import render_baked_rays
+from nimpostor_jax.render.baked import lit_segments, render_baked_rays, shade_segments
+from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.frame import frame_config, render_frame
 from nimpostor_jax.render.raster_frame import rasterize_frame
+from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.types import TetMesh
 
 COUNT = 16
@@ -110,6 +113,22 @@ def test_agrees_with_a_loop_over_tets(overlapping, least, num_sets, x64):
         assert_allclose(output.depth[ray], depth / opacity * scale, atol=1e-8)
     assert np.std(output.opacity) > 0.01
     assert (left_out > COUNT) == (least > 0)
+
+
+@pytest.mark.parametrize("overlapping", [False, True])
+def test_segments_that_no_light_reaches_change_nothing(overlapping, x64):
+    baked = baked_scene(dtype="float64", opacity=(0.3, 0.95))
+    baked = pushed_together(baked) if overlapping else baked
+    config = dataclasses.replace(CONFIG, min_weight=0.05)
+    local = to_local(baked.mesh, rays_at(baked))
+    segments = march_segments(baked.mesh, local, config)
+    lit, count = jax.jit(lit_segments, static_argnames="least")(baked, segments, least=0.05)
+    of_all, of_lit = (np.sum(np.asarray(each.tet_ids) >= 0) for each in (segments, lit))
+    assert COUNT < count == of_lit < 0.8 * of_all
+    shade = jax.jit(shade_segments, static_argnames="config")
+    whole, part = (shade(baked, local, each, config=config) for each in (segments, lit))
+    jax.tree.map(partial(assert_allclose, atol=1e-12), part, whole)  # sums of fewer terms, some of them 0
+    assert np.std(whole.opacity) > 0.01
 
 
 def test_no_rays_at_all():

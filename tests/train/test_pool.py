@@ -125,3 +125,17 @@ def test_random_backgrounds_cover_the_range(pool):
     assert colors.shape == (400, 3)
     assert colors.min() < 0.05
     assert colors.max() > 0.95
+
+
+def test_a_batch_has_the_entries_of_its_rays():
+    """Into a cage with gaps, which some rays enter once and others several times."""
+    mesh = tet_mesh("nonconvex")
+    camera = scenes.camera(WIDTH, HEIGHT, position=(4.0, 9.0, 1.2), target=(1.4, 1.4, 1.0))
+    images = np.zeros((1, HEIGHT, WIDTH, 4), np.float32)
+    pixels, _ = build_pool(mesh, jax.tree.map(lambda x: x[None], camera), images, RENDER.march)
+    batch = draw_batch(jax.random.key(0), 0, pixels, 200, "white")
+    march = dataclasses.replace(RENDER.march, max_entries_per_ray=pixels.entries.slots)
+    expected = ray_entries(mesh, march_tables(mesh), batch.rays, march)
+    jax.tree.map(assert_array_equal, batch.entries, expected)
+    counts = np.sum(np.asarray(batch.entries.holds) >= 0, axis=1)
+    assert counts.min() == 1 and counts.max() == pixels.entries.slots > 1

@@ -143,7 +143,7 @@ def _render_stage(
     """Stage 2, its rays split over all local devices."""
     key, losses = jax.random.key(config.seed + 1), []
     probe = draw_batch(key, 0, pool, min(PROBE_RAYS, config.rays_per_batch), "random")
-    march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.holds.shape[1])
+    march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.slots)
     sized = dataclasses.replace(render, march=march)
     sized = fit_capacities(new.mesh, jax.jit(march_tables)(new.mesh), probe.rays, sized)
     gradient, place = loss_gradient, (lambda batch: batch)

@@ -87,4 +87,15 @@ class FaceGrid:
     ) -> Int[Array, " M"]:
         """Table entries of texels."""
         place, row = node
-        return points.places[0] + row * (row + 1) // 2 + place
+        texels = points.places[0] + row * (row + 1) // 2 + place
+        return texels if self.layout.rows is None else self.layout.rows[texels]
+
+
+def texels_around(
+    layout: FaceLayout, tet_ids: Int[Array, " M"], lambdas: Float[Array, "M 4"]
+) -> tuple[list[Float[Array, " M"]], list[Int[Array, " M"]]]:
+    """Weights and table entries of the three texels around points on faces."""
+    grid, level = FaceGrid(ONE_LEVEL, layout), jnp.int32(0)
+    points = grid.prepare(tet_ids, lambdas)
+    weights, nodes = grid.corners(level, points.coordinates)
+    return weights, [grid.dense_address(level, level, points, node) for node in nodes]

@@ -33,14 +33,12 @@ from nimpostor_jax.train.bake import (
     add_contents,
     add_depths,
     add_seen,
-    init_refinement,
     no_moments,
     nothing_seen,
-    refine_step,
     solve_moments,
-    with_baked_parameters,
 )
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
+from nimpostor_jax.train.refine import init_refinement, refine_step, with_tables
 from nimpostor_jax.train.sharding import device_mesh, over_rays, replicated, sums_by_device
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import BakedImpostor, Embedding, HashTables, NeuralImpostor, TetMesh
@@ -213,7 +211,7 @@ def only_tets(impostor: NeuralImpostor, keep: Bool[np.ndarray, " T"]) -> NeuralI
 
 def fit_config(mesh: TetMesh, pool: PixelPool, probe: RayBatch, config: RenderConfig) -> RenderConfig:
     """With steps for small tets, and buffers for them."""
-    march = dataclasses.replace(config.march, max_entries_per_ray=pool.entries.holds.shape[1])
+    march = dataclasses.replace(config.march, max_entries_per_ray=pool.entries.slots)
     config = dataclasses.replace(config, march=march, frame_refinement=FIT_REFINEMENT)
     config = dataclasses.replace(refined(config), min_weight=max(config.min_weight, 1e-4) / FIT_REFINEMENT)
     return fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, config)
@@ -246,11 +244,15 @@ def refine(
     *,
     log: Log = print,
 ) -> BakedImpostor:
-    """Textures, and decoders where asked, after some steps of training on whole pixels."""
+    """Textures, and decoders where asked, after some steps of training on whole pixels.
+
+    Takes the place of `baked`, whose textures are given up to the steps: they would not fit twice.
+    """
     if not config.refine_steps:
         return baked
     compiled = jax.jit(partial(refine_step, config=render), donate_argnums=0)
-    state = init_refinement(baked)
+    state = init_refinement(dataclasses.replace(baked, decoders=jax.tree.map(jnp.copy, baked.decoders)))
+    baked = with_tables(baked, {name: table[:0] for name, table in state.tables.items()})
     key, found = jax.random.key(train.seed + 3), []
     for i in tqdm(range(config.refine_steps), desc="refine", unit="step", disable=None):
         batch = draw_batch(key, i, pool, train.rays_per_batch, "random")
@@ -264,7 +266,7 @@ def refine(
     first, last = losses[:20].mean(), losses[-20:].mean()
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
     log_lost(lost.mean(), log)
-    return with_baked_parameters(baked, state.parameters)
+    return dataclasses.replace(with_tables(baked, state.tables), decoders=state.decoders)
 
 
 def log_lost(share: float, log: Log) -> None:

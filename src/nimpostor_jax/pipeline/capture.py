@@ -221,7 +221,7 @@ def _light(
     """Ray, world position and share of the ray's light of each visible sample of the chosen pixels."""
     cameras = jax.tree.map(lambda x: x[pool.views[chosen]], pool.cameras)
     rays = pixel_rays(cameras, pool.pixels[chosen] + 0.5)
-    entries = jax.tree.map(lambda x: x[chosen], pool.entries)
+    entries = pool.entries.of(chosen)
     _, samples = render_samples(impostor, rays, config, entries=entries)
     features = field.features(impostor, samples.tet_ids, samples.lambdas, samples.num_used)
     sigmas = sample_densities(impostor, samples.tet_ids, features, samples.num_used)

@@ -133,7 +133,7 @@ def prepare_views(
     entries = np.diff(impostor.tables.layout.starts).tolist()
     log(f"{len(tets)} tets, {sum(entries):,} table entries in {len(entries)} levels {entries}")
     probe = draw_batch(key, 0, pool, min(config.train.rays_per_batch, 8192), "white")
-    entries = pool.entries.holds.shape[1]
+    entries = pool.entries.slots
     march = dataclasses.replace(config.render.march, max_entries_per_ray=entries)
     render = with_step(dataclasses.replace(config.render, march=march), config.impostor.encoding)
     render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, render)

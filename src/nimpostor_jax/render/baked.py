@@ -9,6 +9,7 @@ Axes: R rays, N packed segments, K channels.
 """
 
 import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +22,14 @@ from nimpostor_jax.encoding.hash_grid import encode
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.field.decoder import num_decoder_sets
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.composite import sample_weights, sum_by_ray
+from nimpostor_jax.render.composite import sample_weights, sum_by_ray, transmittance
 from nimpostor_jax.render.renderer import decode_integrated, ray_output
 from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.render.traverse import Entries, MarchTables
 from nimpostor_jax.types import BakedImpostor, HashTables, Rays, RenderOutput, TetSegments
 
 BASIS = 4  # functions of the direction
+ENDS = ("t_enter", "t_exit", "lambda_enter", "lambda_exit")
 MAX_OPACITY = 1 - 2.0**-12  # of one tet: what remains of the light is invisible, and its logarithm finite
 
 
@@ -56,18 +58,14 @@ def shade_segments(
     Opacities come first, and what is seen only where it contributes `min_weight` or more of a ray's light.
     Where tets overlap, what is seen first comes first.
     """
-    used = segments.tet_ids >= 0  # the last used slot ends what is looked at, and few before it are empty
-    num_used = jnp.max(jnp.where(used, jnp.arange(1, used.size + 1, dtype=jnp.int32), 0), initial=0)
-    segments = dataclasses.replace(segments, tet_ids=jnp.maximum(segments.tet_ids, 0))
-    places, t = places_seen(baked.depths, segments, num_used)
-    opacity = jnp.where(used, opacities_at(baked.opacities, segments, places, num_used), 0)
-    order = _along_rays(segments, jax.lax.stop_gradient(t), num_used)
-    optical_depth = -jnp.log1p(-opacity[order])
-    weights = sample_weights(optical_depth, segments.rays, num_used)
+    found = _look_along(baked, segments)
+    num_used = found.num_used
+    weights = sample_weights(found.optical_depth, segments.rays, num_used)
     least, frozen = config.min_weight, jax.lax.stop_gradient(weights)
     visible, num_visible = pack_where(lambda _, weight: weight >= least, None, frozen, num_used)
-    columns = (segments.tet_ids, segments.rays, segments.lambda_exit, places, t)
-    seen, weights = map_used(rows_of, (order, weights), visible, num_visible)
+    tet_ids = jnp.maximum(segments.tet_ids, 0)
+    columns = (tet_ids, segments.rays, segments.lambda_exit, found.places, found.t)
+    seen, weights = map_used(rows_of, (found.order, weights), visible, num_visible)
     tet_ids, owners, lambda_exit, places, t = map_used(rows_of, columns, seen, num_visible)
     texels = encode(baked.textures, ONE_LEVEL, tet_ids, places, num_visible)
     channels = map_used(_channels, (), (texels, lambda_exit, t), num_visible)
@@ -78,6 +76,46 @@ def shade_segments(
     directions = spherical_harmonics(rays.directions, baked.config.decoder.sh_degree)
     sums = decode_integrated(baked.decoders, sums, jnp.tile(directions, (num_sets, 1)))
     return ray_output(sums, baked.mesh.scale, segments.overflow, jnp.zeros_like(segments.overflow))
+
+
+def lit_segments(
+    baked: BakedImpostor, segments: TetSegments, least: float
+) -> tuple[TetSegments, Int[Array, ""]]:
+    """The segments that at least the share `least` of their rays' light reaches, packed; and their number.
+
+    The others contribute less, and so does all that they hide: in `shade_segments` with that `min_weight`
+    they change nothing, nor have they gradients.
+    """
+    found = _look_along(baked, segments)
+    light = transmittance(found.optical_depth, segments.rays, found.num_used)
+    tet_ids = segments.tet_ids[found.order]
+    lit, count = pack_where(
+        lambda _, item: (item[0] >= least) & (item[1] >= 0), None, (light, tet_ids), found.num_used
+    )
+    columns = {name: getattr(segments, name) for name in ("rays", "tet_ids", *ENDS)}
+    packed = map_used(rows_of, columns, map_used(rows_of, found.order, lit, count), count)
+    packed["tet_ids"] = jnp.where(jnp.arange(light.size) < count, packed["tet_ids"], -1)
+    return dataclasses.replace(segments, **packed), count
+
+
+class _Along(NamedTuple):
+    """What rays meet of opacity in their tets."""
+
+    order: Int[Array, " N"]  # of segments: that of what is seen in them
+    optical_depth: Float[Array, " N"]  # in that order
+    places: Float[Array, "N 4"]
+    t: Float[Array, " N"]
+    num_used: Int[Array, ""]
+
+
+def _look_along(baked: BakedImpostor, segments: TetSegments) -> _Along:
+    used = segments.tet_ids >= 0  # the last used slot ends what is looked at, and few before it are empty
+    num_used = jnp.max(jnp.where(used, jnp.arange(1, used.size + 1, dtype=jnp.int32), 0), initial=0)
+    segments = dataclasses.replace(segments, tet_ids=jnp.maximum(segments.tet_ids, 0))
+    places, t = places_seen(baked.depths, segments, num_used)
+    opacity = jnp.where(used, opacities_at(baked.opacities, segments, places, num_used), 0)
+    order = _along_rays(segments, jax.lax.stop_gradient(t), num_used)
+    return _Along(order, -jnp.log1p(-opacity[order]), places, t, num_used)
 
 
 def _along_rays(

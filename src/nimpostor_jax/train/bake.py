@@ -1,4 +1,4 @@
-"""Fitting face textures to a field: what rays gather in single tets, then whole pictures (Sec. 3.4).
+"""Fitting face textures to what rays through a field gather in single tets (Sec. 3.4).
 
 Axes: R rays, N packed segments, M samples, C features, K channels, D decoder sets,
 U tets of the cage that is baked.
@@ -10,28 +10,25 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.chunks import map_used
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.encoding.face_grid import ONE_LEVEL, FaceGrid
+from nimpostor_jax.encoding.face_grid import texels_around
 from nimpostor_jax.field.decoder import apply_layers, num_decoder_sets
-from nimpostor_jax.render.baked import BASIS, places_seen, render_baked_rays
+from nimpostor_jax.render.baked import BASIS, places_seen
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.composite import blend_background, sample_weights, sum_by_ray, transmittance
+from nimpostor_jax.render.composite import sample_weights, sum_by_ray, transmittance
 from nimpostor_jax.render.sampling import place_samples, plan_samples
 from nimpostor_jax.render.segments import in_cells, march_segments
 from nimpostor_jax.render.selection import present_samples, sample_densities, visible_samples
-from nimpostor_jax.train.losses import photometric
-from nimpostor_jax.train.row_adam import RowMoments, no_row_moments, update_rows
-from nimpostor_jax.train.step import Parameters, RayBatch, make_optimizer
-from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, NeuralImpostor, TetSegments
+from nimpostor_jax.train.step import RayBatch
+from nimpostor_jax.types import FaceLayout, HashTables, NeuralImpostor, TetSegments
 
-TABLES = ("depths", "opacities", "textures")
 RIDGE = 1e-3  # of a texel's evidence, against dependence on the direction
 FACE_EVIDENCE = 0.05  # rays that a face's mean counts for in each of its texels
+PAIRS = np.triu_indices(BASIS)
 SOLVED = 1 << 16  # texels at a time
 
 
@@ -160,7 +157,7 @@ def add_seen(seen: Seen, impostor: NeuralImpostor, batch: RayBatch, config: Rend
 class Moments:
     """Weighted sums over rays for each texel's least squares."""
 
-    products: Float[Array, "texels 4 4"]  # of basis functions
+    products: Float[Array, "texels 10"]  # of basis functions, of each pair once (`PAIRS`)
     sums: Float[Array, "texels 4 channels"]  # of basis functions and channels
     lost: Int[Array, ""]  # rays that did not fit into the buffers
 
@@ -168,7 +165,7 @@ class Moments:
 def no_moments(num_texels: int, num_channels: int) -> Moments:
     """Before the first ray."""
     return Moments(
-        products=jnp.zeros((num_texels, BASIS, BASIS)),
+        products=jnp.zeros((num_texels, len(PAIRS[0]))),
         sums=jnp.zeros((num_texels, BASIS, num_channels)),
         lost=jnp.zeros((), jnp.int32),
     )
@@ -219,14 +216,11 @@ def _add(
 ) -> Moments:
     segments = gathered.segments
     tet_ids = jnp.maximum(segments.tet_ids, 0)
-    grid, level = FaceGrid(ONE_LEVEL, layout), jnp.int32(0)
-    points = grid.prepare(tet_ids, places)
     basis = segments.lambda_exit
     products, sums = moments.products, moments.sums
-    for weight, node in zip(*grid.corners(level, points.coordinates), strict=True):
-        entries = grid.dense_address(level, level, points, node)
+    for weight, entries in zip(*texels_around(layout, tet_ids, places), strict=True):
         weighted = (weight * mass)[:, None] * basis
-        products = products.at[entries].add(weighted[:, :, None] * basis[:, None, :])
+        products = products.at[entries].add(weighted[:, PAIRS[0]] * basis[:, PAIRS[1]])
         sums = sums.at[entries].add(weighted[:, :, None] * channels[:, None, :])
     return Moments(products=products, sums=sums, lost=moments.lost + gathered.lost)
 
@@ -240,85 +234,24 @@ def solve_moments(
     held back a little.
     """
     products, sums = np.asarray(moments.products), np.asarray(moments.sums)
+    blocks = [slice(start, start + SOLVED) for start in range(0, len(sums), SOLVED)]
     # The basis' functions add up to 1.
-    mass, total = products.sum(axis=(1, 2), dtype=np.float64), sums.sum(axis=1, dtype=np.float64)
+    once = np.where(PAIRS[0] == PAIRS[1], 1.0, 2.0)
+    mass = np.concatenate([products[block] @ once for block in blocks])
     num_faces = int(face_of_texel.max()) + 1
     face_mass = np.bincount(face_of_texel, mass, num_faces)
-    face_total = np.stack([np.bincount(face_of_texel, column, num_faces) for column in total.T], axis=1)
-    face_mean = face_total / np.maximum(face_mass, 1e-9)[:, None]
+    face_mean = np.zeros((num_faces, sums.shape[2]))
+    for channel in range(sums.shape[2]):
+        total = sums[:, :, channel].sum(axis=1, dtype=np.float64)
+        face_mean[:, channel] = np.bincount(face_of_texel, total, num_faces)
+    face_mean /= np.maximum(face_mass, 1e-9)[:, None]
     solved = np.empty_like(sums)
-    for start in range(0, len(sums), SOLVED):
-        block = slice(start, start + SOLVED)
-        mean = total[block] + FACE_EVIDENCE * face_mean[face_of_texel[block]]
+    for block in blocks:
+        mean = sums[block].sum(axis=1, dtype=np.float64) + FACE_EVIDENCE * face_mean[face_of_texel[block]]
         mean /= (mass[block] + FACE_EVIDENCE)[:, None]
-        system = products[block].astype(np.float64)
+        system = np.empty((len(mean), BASIS, BASIS))
+        system[:, PAIRS[0], PAIRS[1]] = system[:, PAIRS[1], PAIRS[0]] = products[block]
         rest = sums[block] - system.sum(axis=2)[:, :, None] * mean[:, None, :]
         system += (RIDGE * mass[block] + FACE_EVIDENCE)[:, None, None] * np.eye(BASIS)
         solved[block] = mean[:, None, :] + np.linalg.solve(system, rest)
     return solved
-
-
-def baked_parameters(baked: BakedImpostor) -> Parameters:
-    """What refinement trains."""
-    return {name: getattr(baked, name).features for name in TABLES} | {"decoders": baked.decoders}
-
-
-def with_baked_parameters(baked: BakedImpostor, parameters: Parameters) -> BakedImpostor:
-    """The baked impostor with its trained arrays replaced."""
-    tables = {
-        name: dataclasses.replace(getattr(baked, name), features=parameters[name]) for name in TABLES
-    }
-    return dataclasses.replace(baked, **tables, decoders=parameters["decoders"])
-
-
-def baked_loss(
-    parameters: Parameters, baked: BakedImpostor, batch: RayBatch, config: RenderConfig
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Photometric loss of a batch over its backgrounds, without rays that do not fit; and their share."""
-    baked = with_baked_parameters(baked, parameters)
-    output = render_baked_rays(baked, batch.rays, config, entries=batch.entries)
-    color = blend_background(output.color, output.opacity, batch.background)
-    target = blend_background(batch.target[:, :3], batch.target[:, 3], batch.background)
-    return photometric(color, target, output.overflow), jnp.mean(output.overflow)
-
-
-@struct.dataclass
-class RefineState:
-    """What a step of refinement changes."""
-
-    parameters: Parameters
-    moments: dict[str, RowMoments]  # of the tables, of whose texels a batch touches few
-    decoders: optax.OptState
-
-
-def init_refinement(baked: BakedImpostor) -> RefineState:
-    """The state before the first step, of copies: steps may consume it."""
-    parameters = jax.tree.map(jnp.copy, baked_parameters(baked))
-    return RefineState(
-        parameters=parameters,
-        moments={name: no_row_moments(parameters[name]) for name in TABLES},
-        decoders=make_optimizer().init(parameters["decoders"]),
-    )
-
-
-def refine_step(
-    state: RefineState,
-    baked: BakedImpostor,
-    batch: RayBatch,
-    rate: Float[Array, ""],
-    decoder_rate: Float[Array, ""],
-    *,
-    config: RenderConfig,
-) -> tuple[RefineState, Float[Array, " 2"]]:
-    """One step of Adam on a batch, and `baked_loss` before it; pure."""
-    value_and_grad = jax.value_and_grad(baked_loss, has_aux=True)
-    found, gradients = value_and_grad(state.parameters, baked, batch, config)
-    parameters, moments = {}, {}
-    for name in TABLES:
-        updated = update_rows(state.parameters[name], state.moments[name], gradients[name], rate)
-        parameters[name], moments[name] = updated
-    updates, decoders = make_optimizer().update(gradients["decoders"], state.decoders)
-    parameters["decoders"] = jax.tree.map(
-        lambda p, u: p - decoder_rate * u, state.parameters["decoders"], updates
-    )
-    return RefineState(parameters=parameters, moments=moments, decoders=decoders), jnp.stack(found)

@@ -1,12 +1,13 @@
 """The pixels to train on: those of all views whose rays hit the cage, as one pool to draw batches from."""
 
+import dataclasses
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from nimpostor_jax.config import Background, MarchConfig
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
@@ -19,13 +20,35 @@ OPACITY_COST = 1e-3  # of an opaque pixel whose alpha is unknown, in units of sq
 
 
 @struct.dataclass
+class PackedEntries:
+    """`Entries` of P rays without empty slots: most enter a cage in pieces far less often than the worst."""
+
+    holds: Int[Array, " total"]
+    firsts: Int[Array, " P+1"]  # of each ray's; the last is the total
+    overflow: Bool[Array, " P"]
+    unsure: Bool[Array, " P"]
+    slots: int = struct.field(pytree_node=False)  # that the worst ray needs
+
+    def of(self, rays: Int[Array, " n"]) -> Entries:
+        """Entries of some of the rays."""
+        slots = jnp.arange(self.slots, dtype=jnp.int32)
+        firsts, ends = (self.firsts[rays + i][:, None] for i in (0, 1))
+        holds = self.holds[jnp.minimum(firsts + slots, self.holds.size - 1)]
+        return Entries(
+            holds=jnp.where(firsts + slots < ends, holds, -1),
+            overflow=self.overflow[rays],
+            unsure=self.unsure[rays],
+        )
+
+
+@struct.dataclass
 class PixelPool:
     """P pixels of N views."""
 
     views: Int[Array, " P"]
     pixels: Int[Array, "P 2"]  # x, y
     colors: Float[Array, "P 4"]  # premultiplied
-    entries: Entries  # into the cage: pixels and cage stay, so that they are sought once
+    entries: PackedEntries  # into the cage: pixels and cage stay, so that they are sought once
     cameras: Camera  # batched over N
     backgrounds: Float[Array, "P 3"] | None = None  # behind the object, where that is known
 
@@ -45,7 +68,7 @@ def build_pool(
     order = tile_order(cameras.height, cameras.width)
     grid = image_pixels(cameras.height, cameras.width).reshape(-1, 2)[order]
     cast = jax.jit(lambda camera: pixel_rays(camera, grid))
-    views, indices, entries, missed, foreground = [], [], [], 0, 0
+    views, indices, entries, counts, missed, foreground = [], [], [], [], 0, 0
     for view in range(len(images)):
         rays = cast(_one(cameras, view))
         found, grown = all_entries(mesh, tables, rays, march)
@@ -55,11 +78,14 @@ def build_pool(
         solid = images[view, ..., 3].reshape(-1) > 0.5
         missed += int(np.sum(solid & ~hits))
         foreground += int(np.sum(solid))
-        indices.append(np.flatnonzero(hits))
+        indices.append(np.flatnonzero(hits).astype(np.int32))
+        views.append(np.full(len(indices[-1]), view, np.int32))
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
-        entries.append(jax.tree.map(lambda x, kept=rank[indices[-1]]: np.asarray(x)[kept], found))
-        views.append(np.full(len(indices[-1]), view))
+        kept = jax.tree.map(lambda x, rows=rank[indices[-1]]: np.asarray(x)[rows], found)
+        filled = kept.holds >= 0
+        entries.append(dataclasses.replace(kept, holds=kept.holds[filled]))
+        counts.append(np.sum(filled, axis=1))
     if not sum(map(len, indices)):
         raise ValueError(
             f"no pixel of {len(images)} views hits the cage; is it in the cameras' world coordinates?"
@@ -68,26 +94,25 @@ def build_pool(
     flat = images.reshape(len(images), -1, 4)
     behind = None if backgrounds is None else backgrounds.reshape(len(images), -1, 3)
     pool = PixelPool(
-        views=jnp.asarray(view_ids, jnp.int32),
-        pixels=jnp.asarray(
-            np.stack([pixel_ids % cameras.width, pixel_ids // cameras.width], axis=1), jnp.int32
-        ),
+        views=jnp.asarray(view_ids),
+        pixels=jnp.asarray(np.stack([pixel_ids % cameras.width, pixel_ids // cameras.width], axis=1)),
         colors=jnp.asarray(flat[view_ids, pixel_ids]),
-        entries=_concatenated(entries),
+        entries=_packed(entries, np.concatenate(counts)),
         cameras=cameras,
         backgrounds=None if behind is None else jnp.asarray(behind[view_ids, pixel_ids]),
     )
     return pool, missed / max(foreground, 1)
 
 
-def _concatenated(parts: list[Entries]) -> Entries:
-    """Entries of all views, in the slots that the fullest needs; on the host, since shapes differ by view."""
-    slots = max(part.holds.shape[1] for part in parts)
-    holds = [np.pad(p.holds, ((0, 0), (0, slots - p.holds.shape[1])), constant_values=-1) for p in parts]
-    return Entries(
-        holds=jnp.asarray(np.concatenate(holds)),
-        overflow=jnp.asarray(np.concatenate([part.overflow for part in parts])),
-        unsure=jnp.asarray(np.concatenate([part.unsure for part in parts])),
+def _packed(parts: list[Entries], counts: Int[np.ndarray, " P"]) -> PackedEntries:
+    """Entries of all views, whose `holds` have no empty slots any more."""
+    joined = jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)), *parts)
+    return PackedEntries(
+        holds=joined.holds,
+        firsts=jnp.asarray(np.concatenate([[0], np.cumsum(counts)]), jnp.int32),
+        overflow=joined.overflow,
+        unsure=joined.unsure,
+        slots=int(counts.max()),
     )
 
 
@@ -120,6 +145,6 @@ def draw_batch(
         target=pool.colors[chosen],
         background=colors,
         jitter=jax.random.uniform(jitter_key, (size,)),
-        entries=jax.tree.map(lambda x: x[chosen], pool.entries),
+        entries=pool.entries.of(chosen),
         opacity_cost=None if known is None else jnp.full((size,), OPACITY_COST, colors.dtype),
     )

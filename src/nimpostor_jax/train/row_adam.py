@@ -1,14 +1,14 @@
 """Adam for tables of which a batch touches few rows: the others are not read and do not move.
 
 Kingma and Ba (2015), with the constants of `train.step.make_optimizer`. Moments of a row decay with
-the steps that touch it, as in PyTorch's SparseAdam. Axes: N rows, F numbers each.
+the steps that touch it, as in PyTorch's SparseAdam. Axes: N rows, F numbers each; M rows of a batch.
 """
 
 import jax.numpy as jnp
 from flax import struct
 from jaxtyping import Array, Float, Int
 
-from nimpostor_jax.chunks import default_chunk, for_chunks, packed_indices, padded_size, take
+from nimpostor_jax.chunks import default_chunk, for_chunks, pad_items, take
 from nimpostor_jax.train.step import B1, B2, EPSILON
 
 
@@ -31,22 +31,27 @@ def no_row_moments(table: Float[Array, "N F"]) -> RowMoments:
 def update_rows(
     table: Float[Array, "N F"],
     moments: RowMoments,
-    gradient: Float[Array, "N F"],
+    rows: Int[Array, " M"],
+    gradient: Float[Array, "M F"],
+    num_used: Int[Array, ""],
     rate: Float[Array, ""],
 ) -> tuple[Float[Array, "N F"], RowMoments]:
-    """The table after a step at a learning rate; rows without gradient stay as they are. Pure."""
-    count = table.shape[0]
-    rows, num_touched = packed_indices(jnp.any(gradient != 0, axis=1))
-    chunk, order = default_chunk(count), jnp.arange(count, dtype=jnp.int32)
-    rows = jnp.where(order < num_touched, rows, count)
-    rows = jnp.pad(rows, (0, padded_size(count, chunk) - count), constant_values=count)
+    """The table after a step at a learning rate, from the gradient of its first `num_used` `rows`. Pure.
+
+    These are all different. The others stay as they are, and so do those of which the gradient is 0.
+    """
+    chunk = default_chunk(rows.size)
+    rows, gradient = pad_items((rows, gradient), chunk)
     steps = moments.steps + 1
     unbiased = [1 - b ** steps.astype(table.dtype) for b in (B1, B2)]
+    order = jnp.arange(chunk, dtype=jnp.int32)
 
     def update(start: Int[Array, ""], tables: tuple) -> tuple:
         table, first, second = tables
-        at = take(rows, start, chunk)
-        slope, one, two = (x.at[at].get(mode="fill", fill_value=0) for x in (gradient, first, second))
+        at, slope = take((rows, gradient), start, chunk)
+        touched = jnp.any(slope != 0, axis=1) & (start + order < num_used)
+        at = jnp.where(touched, at, table.shape[0])
+        one, two = (x.at[at].get(mode="fill", fill_value=0) for x in (first, second))
         one = B1 * one + (1 - B1) * slope
         two = B2 * two + (1 - B2) * slope**2
         moved = rate * (one / unbiased[0]) / (jnp.sqrt(two / unbiased[1]) + EPSILON)
@@ -56,5 +61,5 @@ def update_rows(
             second.at[at].set(two, mode="drop"),
         )
 
-    table, first, second = for_chunks(num_touched, chunk, update, (table, moments.first, moments.second))
+    table, first, second = for_chunks(num_used, chunk, update, (table, moments.first, moments.second))
     return table, RowMoments(first=first, second=second, steps=steps)

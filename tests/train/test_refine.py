@@ -1,0 +1,102 @@
+"""train.refine: training of face textures on whole pictures, from the texels that a batch looks up."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scenes_baked
+from meshes import local_vertices
+from numpy.testing import assert_allclose, assert_array_equal
+from rays import as_rays, generic
+from scenes import RENDER, pushed_together
+
+from nimpostor_jax import chunks
+from nimpostor_jax.encoding.face_grid import texels_around
+from nimpostor_jax.render.baked import places_seen, render_baked_rays
+from nimpostor_jax.render.camera import to_local
+from nimpostor_jax.render.composite import blend_background
+from nimpostor_jax.render.segments import march_segments
+from nimpostor_jax.train.losses import photometric
+from nimpostor_jax.train.refine import TABLES, init_refinement, looked_up, refine_step, with_tables
+from nimpostor_jax.train.step import EPSILON, RayBatch
+
+COUNT = 32
+MARCH = dataclasses.replace(RENDER.march, max_tets_per_ray=24, max_entries_per_ray=3)
+CONFIG = dataclasses.replace(RENDER, march=MARCH, min_weight=1e-3)
+step = jax.jit(partial(refine_step, config=CONFIG))
+
+
+def batch_for(baked, rng):
+    origins, directions = generic(*local_vertices(baked.mesh), rng, COUNT)
+    center, scale = np.asarray(baked.mesh.center), float(baked.mesh.scale)
+    rays = as_rays((center + scale * origins, directions), baked.mesh.vertices.dtype)
+    target = jnp.full((COUNT, 4), 0.5).at[:, :3].set(jnp.asarray([0.4, 0.1, 0.2]))
+    return RayBatch(rays=rays, target=target, background=jnp.zeros((COUNT, 3)), jitter=jnp.zeros(COUNT))
+
+
+def test_refinement_lowers_the_loss_and_leaves_decoders_alone_at_rate_zero(rng):
+    baked = scenes_baked.baked(num_sets=2)
+    batch, state, losses = batch_for(baked, rng), init_refinement(baked), []
+    for _ in range(60):
+        state, (loss, lost) = step(state, baked, batch, jnp.float32(0.02), jnp.float32(0))
+        losses.append(float(loss))
+        assert lost == 0
+    assert losses[-1] < 0.2 * losses[0]
+    jax.tree.map(assert_array_equal, state.decoders, baked.decoders)
+    for name in TABLES:
+        assert np.any(state.tables[name] != getattr(baked, name).features)
+
+
+@pytest.mark.parametrize("overlapping", [False, True])
+def test_a_step_is_that_of_all_texels(overlapping, rng, monkeypatch, x64):
+    """The first step of Adam by the gradient of the whole tables; in small chunks."""
+    monkeypatch.setattr(chunks, "CPU_CHUNK", 64)
+    baked = scenes_baked.baked(dtype="float64")
+    baked = pushed_together(baked) if overlapping else baked
+    batch = batch_for(baked, rng)
+
+    def loss(tables, decoders):
+        whole = dataclasses.replace(with_tables(baked, tables), decoders=decoders)
+        output = render_baked_rays(whole, batch.rays, CONFIG)
+        color = blend_background(output.color, output.opacity, batch.background)
+        target = blend_background(batch.target[:, :3], batch.target[:, 3], batch.background)
+        return photometric(color, target, output.overflow)
+
+    start = init_refinement(baked)
+    value, gradients = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(start.tables, start.decoders)
+    one_step = jax.jit(partial(refine_step, config=CONFIG))
+    state, found = one_step(start, baked, batch, jnp.asarray(0.02), jnp.asarray(0.01))
+    assert_allclose(found[0], value, rtol=1e-12)
+    before, after = (start.tables, start.decoders), (state.tables, state.decoders)
+    for rate, g, old, new in zip((0.02, 0.01), gradients, before, after, strict=True):
+        moved = jax.tree.map(lambda g, old, rate=rate: old - rate * g / (abs(g) + EPSILON), g, old)
+        # where gradients are as small as Adam's epsilon, their own rounding is divided by it
+        jax.tree.map(partial(assert_allclose, atol=1e-8), new, moved)
+    assert 0.05 < np.mean(np.any(gradients[0]["textures"] != 0, axis=1)) < 0.95
+
+
+def test_each_texel_that_is_looked_up_is_there_once(rng, monkeypatch):
+    monkeypatch.setattr(chunks, "CPU_CHUNK", 64)
+    baked = scenes_baked.baked()
+    batch = batch_for(baked, rng)
+    segments = march_segments(baked.mesh, to_local(baked.mesh, batch.rays), CONFIG)
+    used = np.asarray(segments.tet_ids) >= 0
+    rows, layout, count = jax.jit(looked_up)(baked, segments, jnp.int32(np.flatnonzero(used)[-1] + 1))
+    tets = jnp.maximum(segments.tet_ids, 0)
+    places, _ = places_seen(baked.depths, dataclasses.replace(segments, tet_ids=tets), jnp.int32(tets.size))
+    expected = [
+        np.asarray(texels)[used]
+        for points in (segments.lambda_enter, places)
+        for texels in texels_around(baked.depths.layout, tets, points)[1]
+    ]
+    found = np.asarray(rows)[: int(count)]
+    assert len(np.unique(found)) == len(found)
+    # Empty slots among the used ones look up the first tet's, so that there may be a few more.
+    assert set(np.concatenate(expected)) <= set(found)
+    assert len(found) <= len(set(np.concatenate(expected))) + 6
+    assert_array_equal(np.asarray(layout.rows)[found], np.arange(len(found)))
+    assert np.all((np.asarray(layout.rows) >= 0) & (np.asarray(layout.rows) < rows.size))
+    assert 0 < len(found) < len(baked.depths.features)
