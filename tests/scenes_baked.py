@@ -12,11 +12,11 @@ from nimpostor_jax.types import BakedImpostor, HashTables
 CHANNELS = 3
 
 
-def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), num_sets=1):
-    """Textures of 1 to 8 texels along an edge, opacities between the given ones; decoder sets take turns."""
+def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), num_sets=1, finest=8):
+    """Textures of 1 to `finest` texels along an edge, random opacities; decoder sets take turns."""
     made = scenes.impostor(name, dtype)
     rng = np.random.default_rng(seed)
-    resolutions = rng.integers(1, 9, (len(made.mesh.tets), 4))
+    resolutions = rng.integers(1, finest + 1, (len(made.mesh.tets), 4))
     layout = build_face_layout(resolutions)
     count = int(num_texels(resolutions).sum())
 

@@ -100,3 +100,19 @@ def test_each_texel_that_is_looked_up_is_there_once(rng, monkeypatch):
     assert_array_equal(np.asarray(layout.rows)[found], np.arange(len(found)))
     assert np.all((np.asarray(layout.rows) >= 0) & (np.asarray(layout.rows) < rows.size))
     assert 0 < len(found) < len(baked.depths.features)
+
+
+def test_a_step_needs_memory_for_a_batch_and_one_number_a_texel(rng):
+    """Beside the tables, which it may consume: no gradient of all texels."""
+    sizes, texels = [], []
+    for finest in (8, 80):
+        baked = scenes_baked.baked(finest=finest)
+        state, rate = init_refinement(baked), jnp.float32(0.02)
+        lowered = jax.jit(partial(refine_step, config=CONFIG), donate_argnums=0).lower(
+            state, baked, batch_for(baked, rng), rate, rate
+        )
+        sizes.append(lowered.compile().memory_analysis().temp_size_in_bytes)
+        texels.append(len(baked.depths.features))
+    assert texels[1] > 50 * texels[0]
+    # The number of each texel, and its copy where loops that write it begin.
+    assert sizes[1] - sizes[0] < 3 * 4 * (texels[1] - texels[0])
