@@ -23,6 +23,7 @@ from benchmark import first_camera
 
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
+from nimpostor_jax.field.decoder import num_decoder_sets
 from nimpostor_jax.field.impostor import merge_levels
 from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.impostor_file import load_baked, load_impostor
@@ -155,15 +156,16 @@ def baked_stages(baked: BakedImpostor, rays: Rays, config: RenderConfig) -> list
     local, tables, entries, segments = march_stages(stage, baked.mesh, rays, config)
     used = dataclasses.replace(segments, tet_ids=jnp.maximum(segments.tet_ids, 0))
     count = jnp.sum(segments.tet_ids >= 0)
-    places, _ = stage("depths", places_seen, baked.depths, used, count)
-    stage("opacities", opacities_at, baked.opacities, used, places, count)
+    last = jnp.max(jnp.where(segments.tet_ids >= 0, jnp.arange(segments.rays.size), 0)) + 1
+    places, _ = stage("depths", places_seen, baked.depths, used, last)
+    stage("opacities", opacities_at, baked.opacities, used, places, last)
     shade = partial(shade_segments, config=config)
     shown = stage("all lookups", shade, baked, local, segments)
-    sums = jnp.ones((len(rays.origins), baked.textures.features.shape[1] // BASIS + 2))
-    sums = jnp.where(shown.opacity[:, None] > 0, sums, 0)  # as many as are decoded, of whatever colours
+    num_sets, channels = num_decoder_sets(baked.decoders), baked.textures.features.shape[1] // BASIS
     directions = spherical_harmonics(rays.directions, baked.config.decoder.sh_degree)
-    stage("their decoder", decode_integrated, baked.decoders, sums, directions)
-    _, lit = lit_segments(baked, segments, config.min_weight)
+    each = jnp.ones((num_sets * len(rays.origins), channels + 2)), jnp.tile(directions, (num_sets, 1))
+    stage("their decoder", decode_integrated, baked.decoders, *each)
+    *_, lit = lit_segments(baked, segments, config.min_weight)
     everything = lambda b, r, t, e: render_baked_rays(b, r, config, t, e)  # noqa: E731
     stage("all", everything, baked, rays, tables, entries)
     visible = int(jnp.sum(shown.opacity > 0))

@@ -28,11 +28,14 @@ from nimpostor_jax.field.solids import to_cells
 from nimpostor_jax.geometry.locate import locate_tables
 from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
 from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
-from nimpostor_jax.render.camera import image_pixels, pixel_rays
+from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
+from nimpostor_jax.render.capacity import ray_entries
 from nimpostor_jax.render.occupancy import cell_index, in_occupied_cells, num_cells
 from nimpostor_jax.render.renderer import render_rays, render_samples
+from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.render.selection import optical_weights
-from nimpostor_jax.train.pool import draw_batch
+from nimpostor_jax.render.traverse import march_tables
+from nimpostor_jax.train.pool import build_pool, draw_batch
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import FunctionSolid
 
@@ -309,6 +312,22 @@ def test_points_follow_what_is_seen(monkeypatch, known):
     even = np.repeat(volumes / volumes.sum() / parts, parts)
     target = 0.8 * np.ravel(seen) / np.sum(seen) + 0.2 * even
     assert_allclose(drawn, target, atol=0.005)  # three standard deviations of 50,000 draws
+
+
+def test_pictures_show_a_region_by_the_rays_that_cross_it():
+    """A part of a cage with gaps: rays know where they enter the whole of it."""
+    made = scenes.impostor("nonconvex")
+    region = Region(tets=jnp.arange(6), entries=jnp.arange(0), decoder_sets=jnp.arange(0))
+    pool = pictures_of(made, made, region, CONFIG, QUICK)
+    whole, _ = build_pool(made.mesh, pool.cameras, np.zeros((6, 32, 32, 4), np.float32), CONFIG.march)
+    batch = draw_batch(jax.random.key(0), 0, pool, 256, "white")
+    march = dataclasses.replace(CONFIG.march, max_entries_per_ray=pool.entries.slots)
+    tables = march_tables(made.mesh)
+    jax.tree.map(assert_array_equal, batch.entries, ray_entries(made.mesh, tables, batch.rays, march))
+    segments = march_segments(made.mesh, to_local(made.mesh, batch.rays), CONFIG)
+    crossed = np.unique(np.asarray(segments.rays)[np.isin(segments.tet_ids, np.arange(6))])
+    assert_array_equal(crossed, np.arange(256))
+    assert 0 < len(pool.views) < 0.9 * len(whole.views)
 
 
 @pytest.mark.parametrize("seen", [None, 0.0])

@@ -2,16 +2,19 @@
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 import scenes
+import scenes_baked
 from scenes import constant_density
 
-from nimpostor_jax.config import BakeConfig
+from nimpostor_jax.config import BakeConfig, TrainConfig
 from nimpostor_jax.edit.subdivide import subdivide
-from nimpostor_jax.pipeline.bake import bake, checked_texels, face_pixels, only_tets
+from nimpostor_jax.pipeline.bake import bake, checked_texels, face_pixels, only_tets, refine
 from nimpostor_jax.pipeline.prepare import prepare
 from nimpostor_jax.render.frame import render_frame
+from nimpostor_jax.train.pool import build_pool
 
 CORNERS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0, 0]])
 
@@ -42,6 +45,26 @@ def test_an_impostor_that_shows_nothing_is_refused(config, cage):
     scene = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
     with pytest.raises(ValueError, match="nothing is seen in any tet; train the impostor"):
         bake(constant_density(scene.impostor, -40.0), scene, BakeConfig(fit_rays=1000), log=lambda _: None)
+
+
+@pytest.mark.parametrize("decoders", [False, True])
+def test_refinement_gives_up_textures_and_nothing_else(decoders):
+    """Other arrays of the impostor that it takes stay readable; decoders change only where asked."""
+    baked = scenes_baked.baked()
+    texels = baked.textures.features.shape
+    cameras = jax.tree.map(lambda x: x[None], scenes.camera(24, 18, (8.0, 6.0, 5.0), (-0.9, 0.5, 0.8)))
+    march = dataclasses.replace(scenes.RENDER.march, max_tets_per_ray=24, max_entries_per_ray=3)
+    pool, _ = build_pool(baked.mesh, cameras, np.full((1, 18, 24, 4), 0.5, np.float32), march)
+    config = BakeConfig(refine_steps=3, refine_decoders=decoders)
+    render = dataclasses.replace(scenes.RENDER, march=march)
+    lines = []
+    refined = refine(baked, pool, TrainConfig(rays_per_batch=64), render, config, log=lines.append)
+    assert len(lines) == 1 and lines[0].startswith("refined: loss")
+    assert refined.textures.features.shape == texels and np.all(np.isfinite(refined.textures.features))
+    assert refined.textures.layout is baked.textures.layout  # not that of a batch's texels
+    pairs = zip(jax.tree.leaves(refined.decoders), jax.tree.leaves(baked.decoders), strict=True)
+    assert any(np.any(ours != theirs) for ours, theirs in pairs) == decoders
+    np.testing.assert_array_equal(refined.mesh.vertices, baked.mesh.vertices)
 
 
 def test_what_is_left_of_tets_keeps_its_place_in_the_field():

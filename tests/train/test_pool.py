@@ -128,14 +128,22 @@ def test_random_backgrounds_cover_the_range(pool):
 
 
 def test_a_batch_has_the_entries_of_its_rays():
-    """Into a cage with gaps, which some rays enter once and others several times."""
+    """Into a cage with gaps, which rays enter once or several times; of all pixels, and of some."""
     mesh = tet_mesh("nonconvex")
-    camera = scenes.camera(WIDTH, HEIGHT, position=(4.0, 9.0, 1.2), target=(1.4, 1.4, 1.0))
-    images = np.zeros((1, HEIGHT, WIDTH, 4), np.float32)
-    pixels, _ = build_pool(mesh, jax.tree.map(lambda x: x[None], camera), images, RENDER.march)
-    batch = draw_batch(jax.random.key(0), 0, pixels, 200, "white")
-    march = dataclasses.replace(RENDER.march, max_entries_per_ray=pixels.entries.slots)
-    expected = ray_entries(mesh, march_tables(mesh), batch.rays, march)
-    jax.tree.map(assert_array_equal, batch.entries, expected)
-    counts = np.sum(np.asarray(batch.entries.holds) >= 0, axis=1)
-    assert counts.min() == 1 and counts.max() == pixels.entries.slots > 1
+    places = ((4.0, 9.0, 1.2), (1.6, 1.4, 9.0))
+    cameras = [scenes.camera(WIDTH, HEIGHT, position=p, target=(1.4, 1.4, 1.0)) for p in places]
+    images = np.zeros((2, HEIGHT, WIDTH, 4), np.float32)
+    images[..., 0], images[..., 1] = np.arange(2)[:, None, None], np.arange(WIDTH) / WIDTH
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *cameras)
+    whole, _ = build_pool(mesh, stacked, images, RENDER.march, images[..., :3])
+    march = dataclasses.replace(RENDER.march, max_entries_per_ray=whole.entries.slots)
+    kept = np.flatnonzero(np.arange(len(whole.views)) % 3 != 1)
+    for pixels in (whole, whole.take(kept)):
+        batch = draw_batch(jax.random.key(0), 0, pixels, 200, "white")
+        expected = ray_entries(mesh, march_tables(mesh), batch.rays, march)
+        jax.tree.map(assert_array_equal, batch.entries, expected)
+        assert_array_equal(batch.background, batch.target[:, :3])
+        counts = np.sum(np.asarray(batch.entries.holds) >= 0, axis=1)
+        assert counts.min() == 1 and counts.max() == whole.entries.slots > 1
+        assert set(np.asarray(pixels.views)) == {0, 1}
+    assert_array_equal(pixels.colors, np.asarray(whole.colors)[kept])

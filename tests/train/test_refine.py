@@ -21,7 +21,7 @@ from nimpostor_jax.render.composite import blend_background
 from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.train.losses import photometric
 from nimpostor_jax.train.refine import TABLES, init_refinement, looked_up, refine_step, with_tables
-from nimpostor_jax.train.step import EPSILON, RayBatch
+from nimpostor_jax.train.step import B1, B2, EPSILON, RayBatch
 
 COUNT = 32
 MARCH = dataclasses.replace(RENDER.march, max_tets_per_ray=24, max_entries_per_ray=3)
@@ -50,11 +50,11 @@ def test_refinement_lowers_the_loss_and_leaves_decoders_alone_at_rate_zero(rng):
         assert np.any(state.tables[name] != getattr(baked, name).features)
 
 
-@pytest.mark.parametrize("overlapping", [False, True])
-def test_a_step_is_that_of_all_texels(overlapping, rng, monkeypatch, x64):
-    """The first step of Adam by the gradient of the whole tables; in small chunks."""
+@pytest.mark.parametrize(("overlapping", "num_sets"), [(False, 1), (True, 1), (False, 2)])
+def test_a_step_is_that_of_all_texels(overlapping, num_sets, rng, monkeypatch, x64):
+    """The first step of Adam, and its moments, by the gradient of the whole tables; in small chunks."""
     monkeypatch.setattr(chunks, "CPU_CHUNK", 64)
-    baked = scenes_baked.baked(dtype="float64")
+    baked = scenes_baked.baked(dtype="float64", num_sets=num_sets)
     baked = pushed_together(baked) if overlapping else baked
     batch = batch_for(baked, rng)
 
@@ -75,7 +75,14 @@ def test_a_step_is_that_of_all_texels(overlapping, rng, monkeypatch, x64):
         moved = jax.tree.map(lambda g, old, rate=rate: old - rate * g / (abs(g) + EPSILON), g, old)
         # where gradients are as small as Adam's epsilon, their own rounding is divided by it
         jax.tree.map(partial(assert_allclose, atol=1e-8), new, moved)
-    assert 0.05 < np.mean(np.any(gradients[0]["textures"] != 0, axis=1)) < 0.95
+    # sums of float64 terms in another order
+    close = partial(assert_allclose, rtol=1e-9, atol=1e-15)
+    for name in TABLES:
+        close(state.moments[name].first, (1 - B1) * gradients[0][name])
+        close(state.moments[name].second, (1 - B2) * gradients[0][name] ** 2)
+    of_decoders = jax.tree.map(lambda g: (1 - B1) * g, gradients[1])
+    jax.tree.map(close, state.decoder_moments.mu, of_decoders)
+    assert 0.01 < np.mean(np.any(gradients[0]["textures"] != 0, axis=1)) < 0.95
 
 
 def test_each_texel_that_is_looked_up_is_there_once(rng, monkeypatch):
@@ -84,9 +91,9 @@ def test_each_texel_that_is_looked_up_is_there_once(rng, monkeypatch):
     batch = batch_for(baked, rng)
     segments = march_segments(baked.mesh, to_local(baked.mesh, batch.rays), CONFIG)
     used = np.asarray(segments.tet_ids) >= 0
-    rows, layout, count = jax.jit(looked_up)(baked, segments, jnp.int32(np.flatnonzero(used)[-1] + 1))
-    tets = jnp.maximum(segments.tet_ids, 0)
-    places, _ = places_seen(baked.depths, dataclasses.replace(segments, tet_ids=tets), jnp.int32(tets.size))
+    tets, last = jnp.maximum(segments.tet_ids, 0), jnp.int32(np.flatnonzero(used)[-1] + 1)
+    places, _ = places_seen(baked.depths, dataclasses.replace(segments, tet_ids=tets), last)
+    rows, layout, count = jax.jit(looked_up)(baked.depths, segments, places, last)
     expected = [
         np.asarray(texels)[used]
         for points in (segments.lambda_enter, places)

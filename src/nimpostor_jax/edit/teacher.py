@@ -3,7 +3,6 @@
 Axes: N views, P pixels.
 """
 
-import dataclasses
 
 import jax
 import jax.numpy as jnp
@@ -38,13 +37,7 @@ def pictures_of(
     pool, _ = build_pool(new.mesh, cameras, images, render.march)
     if region.tets.size == new.mesh.tets.shape[0]:
         return pool
-    crosses = _crosses(new.mesh, region, pool, render.march)
-    kept = np.flatnonzero(crosses)
-    taken = {
-        name: jax.tree.map(lambda x: x[kept], getattr(pool, name))
-        for name in ("views", "pixels", "colors", "entries")
-    }
-    return dataclasses.replace(pool, **taken)
+    return pool.take(np.flatnonzero(_crosses(new.mesh, region, pool, render.march)))
 
 
 def cameras_around(mesh: TetMesh, region: Region, count: int, width: int) -> Camera:

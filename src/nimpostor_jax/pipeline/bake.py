@@ -91,6 +91,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     found = rays.add_up(partial(moments, 1), add_depths, DEPTHS_SHARE, "depths", part, layout)
     log_lost(int(found.lost) / (DEPTHS_SHARE * config.fit_rays), log)
     depths = table(found)
+    del found
     contents = rays.add_up(
         lambda: (moments(1), moments(num_channels)), add_contents, 1.0, "contents", part, layers, depths
     )
@@ -246,11 +247,12 @@ def refine(
 ) -> BakedImpostor:
     """Textures, and decoders where asked, after some steps of training on whole pixels.
 
-    Takes the place of `baked`, whose textures are given up to the steps: they would not fit twice.
+    Takes the place of `baked`, whose textures are given up to the steps: all of them would not fit twice.
     """
     if not config.refine_steps:
         return baked
     compiled = jax.jit(partial(refine_step, config=render), donate_argnums=0)
+    # Steps consume the state, and read the rest of `baked` beside it.
     state = init_refinement(dataclasses.replace(baked, decoders=jax.tree.map(jnp.copy, baked.decoders)))
     baked = with_tables(baked, {name: table[:0] for name, table in state.tables.items()})
     key, found = jax.random.key(train.seed + 3), []

@@ -80,11 +80,11 @@ def shade_segments(
 
 def lit_segments(
     baked: BakedImpostor, segments: TetSegments, least: float
-) -> tuple[TetSegments, Int[Array, ""]]:
+) -> tuple[TetSegments, Float[Array, "N 4"], Int[Array, ""]]:
     """The segments that at least the share `least` of their rays' light reaches, packed; and their number.
 
-    The others contribute less, and so does all that they hide: in `shade_segments` with that `min_weight`
-    they change nothing, nor have they gradients.
+    And the places on faces at which they look up what is seen. The others contribute less, and so does all
+    that they hide: in `shade_segments` with that `min_weight` they change nothing, nor have they gradients.
     """
     found = _look_along(baked, segments)
     light = transmittance(found.optical_depth, segments.rays, found.num_used)
@@ -93,9 +93,10 @@ def lit_segments(
         lambda _, item: (item[0] >= least) & (item[1] >= 0), None, (light, tet_ids), found.num_used
     )
     columns = {name: getattr(segments, name) for name in ("rays", "tet_ids", *ENDS)}
-    packed = map_used(rows_of, columns, map_used(rows_of, found.order, lit, count), count)
+    chosen = map_used(rows_of, found.order, lit, count)
+    packed, places = map_used(rows_of, (columns, found.places), chosen, count)
     packed["tet_ids"] = jnp.where(jnp.arange(light.size) < count, packed["tet_ids"], -1)
-    return dataclasses.replace(segments, **packed), count
+    return dataclasses.replace(segments, **packed), places, count
 
 
 class _Along(NamedTuple):

@@ -40,6 +40,20 @@ class PackedEntries:
             unsure=self.unsure[rays],
         )
 
+    def take(self, rays: Int[np.ndarray, " n"]) -> "PackedEntries":
+        """These rays alone. Host code."""
+        firsts = np.asarray(self.firsts)
+        counts = np.diff(firsts)[rays]
+        ends = np.cumsum(counts)
+        places = np.repeat(firsts[rays] - (ends - counts), counts) + np.arange(counts.sum())
+        return PackedEntries(
+            holds=self.holds[places],
+            firsts=jnp.asarray(np.concatenate([[0], ends]), jnp.int32),
+            overflow=self.overflow[rays],
+            unsure=self.unsure[rays],
+            slots=self.slots,
+        )
+
 
 @struct.dataclass
 class PixelPool:
@@ -51,6 +65,17 @@ class PixelPool:
     entries: PackedEntries  # into the cage: pixels and cage stay, so that they are sought once
     cameras: Camera  # batched over N
     backgrounds: Float[Array, "P 3"] | None = None  # behind the object, where that is known
+
+    def take(self, pixels: Int[np.ndarray, " n"]) -> "PixelPool":
+        """These pixels alone. Host code."""
+        return dataclasses.replace(
+            self,
+            views=self.views[pixels],
+            pixels=self.pixels[pixels],
+            colors=self.colors[pixels],
+            entries=self.entries.take(pixels),
+            backgrounds=None if self.backgrounds is None else self.backgrounds[pixels],
+        )
 
 
 def build_pool(

@@ -18,14 +18,14 @@ from jaxtyping import Array, Bool, Float, Int
 from nimpostor_jax.chunks import default_chunk, for_chunks, map_used, pack_where, pad_items, rows_of, take
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.encoding.face_grid import texels_around
-from nimpostor_jax.render.baked import lit_segments, places_seen, shade_segments
+from nimpostor_jax.render.baked import lit_segments, shade_segments
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import blend_background
 from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.train.losses import photometric
 from nimpostor_jax.train.row_adam import RowMoments, no_row_moments, update_rows
 from nimpostor_jax.train.step import RayBatch, make_optimizer
-from nimpostor_jax.types import BakedImpostor, FaceLayout, TetSegments
+from nimpostor_jax.types import BakedImpostor, FaceLayout, HashTables, TetSegments
 
 TABLES = ("depths", "opacities", "textures")
 Tables = dict[str, Float[Array, "texels F"]]
@@ -42,7 +42,7 @@ class RefineState:
 
 
 def init_refinement(baked: BakedImpostor) -> RefineState:
-    """The state before the first step."""
+    """The state before the first step, of the arrays of `baked` themselves."""
     tables = {name: getattr(baked, name).features for name in TABLES}
     return RefineState(
         tables=tables,
@@ -54,7 +54,7 @@ def init_refinement(baked: BakedImpostor) -> RefineState:
 
 def with_tables(baked: BakedImpostor, tables: Tables, layout: FaceLayout | None = None) -> BakedImpostor:
     """The baked impostor with its tables' arrays replaced, and their layout where that is given."""
-    changes: dict[str, Any] = {"layout": layout} if layout else {}
+    changes: dict[str, Any] = {} if layout is None else {"layout": layout}
     named = {
         name: dataclasses.replace(getattr(baked, name), features=tables[name], **changes) for name in TABLES
     }
@@ -77,8 +77,8 @@ def refine_step(
     rays = to_local(baked.mesh, batch.rays)
     segments = march_segments(baked.mesh, rays, config, entries=batch.entries)
     whole = with_tables(baked, state.tables)
-    segments, num_segments = lit_segments(whole, segments, config.min_weight)
-    rows, layout, count = looked_up(whole, segments, num_segments)
+    segments, places, num_segments = lit_segments(whole, segments, config.min_weight)
+    rows, layout, count = looked_up(whole.depths, segments, places, num_segments)
     part = map_used(rows_of, state.tables, rows, count)
 
     def loss(part: Tables, decoders: dict[str, Any]) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -100,22 +100,24 @@ def refine_step(
 
 
 def looked_up(
-    baked: BakedImpostor, segments: TetSegments, num_used: Int[Array, ""]
+    table: HashTables, segments: TetSegments, places: Float[Array, "N 4"], num_used: Int[Array, ""]
 ) -> tuple[Int[Array, " M"], FaceLayout, Int[Array, ""]]:
     """The texels of the first segments, each once; the layout of a table of these alone; and their number.
 
-    There is room for all that could be. Work and memory follow the segments, but for one number a texel.
+    They are those around the points of entry, and around the places to which depths lead. There is room for
+    all that could be. Work and memory follow the segments, but for one number a texel, and that is 0 for
+    texels that are not there: nobody may ask for them.
     """
-    used = dataclasses.replace(segments, tet_ids=jnp.maximum(segments.tet_ids, 0))
-    places, _ = places_seen(baked.depths, used, num_used)
-    layout: FaceLayout = baked.depths.layout  # type: ignore[assignment]
-    wanted = map_used(_texels_of, layout, (used.tet_ids, used.lambda_enter, places), num_used)
+    layout: FaceLayout = table.layout  # type: ignore[assignment]
+    num_texels = table.features.shape[0]
+    points = jnp.maximum(segments.tet_ids, 0), segments.lambda_enter, places
+    wanted = map_used(_texels_of, layout, points, num_used)
     wanted, num_wanted = wanted.reshape(-1), wanted.shape[1] * num_used
     positions = jnp.arange(wanted.size, dtype=jnp.int32)
     # All write their position where they point to. One of them is found there afterwards: it stands for all.
-    owners = _write(jnp.zeros(len(baked.depths.features), jnp.int32), wanted, num_wanted)
+    owners = _write(jnp.zeros(num_texels, jnp.int32), wanted, num_wanted)
     chosen, count = pack_where(_is_owner, owners, (wanted, positions), num_wanted)
-    rows = map_used(rows_of, wanted, chosen, count)
+    rows = map_used(rows_of, wanted, chosen[:num_texels], count)
     return rows, dataclasses.replace(layout, rows=_write(owners, rows, count)), count
 
 
