@@ -15,12 +15,19 @@ from scenes import RENDER, pushed_together
 
 from nimpostor_jax import chunks
 from nimpostor_jax.encoding.face_grid import texels_around
-from nimpostor_jax.render.baked import places_seen, render_baked_rays
+from nimpostor_jax.render.baked import render_baked_rays
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import blend_background
 from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.train.losses import photometric
-from nimpostor_jax.train.refine import TABLES, init_refinement, looked_up, refine_step, with_tables
+from nimpostor_jax.train.refine import (
+    TABLES,
+    count_lit,
+    init_refinement,
+    looked_up,
+    refine_step,
+    with_tables,
+)
 from nimpostor_jax.train.step import B1, B2, EPSILON, RayBatch
 
 COUNT = 32
@@ -90,23 +97,37 @@ def test_each_texel_that_is_looked_up_is_there_once(rng, monkeypatch):
     baked = scenes_baked.baked()
     batch = batch_for(baked, rng)
     segments = march_segments(baked.mesh, to_local(baked.mesh, batch.rays), CONFIG)
-    used = np.asarray(segments.tet_ids) >= 0
-    tets, last = jnp.maximum(segments.tet_ids, 0), jnp.int32(np.flatnonzero(used)[-1] + 1)
-    places, _ = places_seen(baked.depths, dataclasses.replace(segments, tet_ids=tets), last)
-    rows, layout, count = jax.jit(looked_up)(baked.depths, segments, places, last)
-    expected = [
-        np.asarray(texels)[used]
-        for points in (segments.lambda_enter, places)
-        for texels in texels_around(baked.depths.layout, tets, points)[1]
-    ]
+    tets, last = jnp.maximum(segments.tet_ids, 0), np.flatnonzero(segments.tet_ids >= 0)[-1] + 1
+    arguments = baked.depths.layout, len(baked.depths.features), tets, segments.lambda_enter, jnp.int32(last)
+    rows, layout, count = jax.jit(looked_up, static_argnums=1)(*arguments)
+    texels = texels_around(baked.depths.layout, tets, segments.lambda_enter)[1]
     found = np.asarray(rows)[: int(count)]
     assert len(np.unique(found)) == len(found)
-    # Empty slots among the used ones look up the first tet's, so that there may be a few more.
-    assert set(np.concatenate(expected)) <= set(found)
-    assert len(found) <= len(set(np.concatenate(expected))) + 6
+    # The chunk in which the used points end is looked up as a whole, but only they count.
+    assert set(np.stack(texels, axis=1)[:last].ravel()) == set(found)
     assert_array_equal(np.asarray(layout.rows)[found], np.arange(len(found)))
     assert np.all((np.asarray(layout.rows) >= 0) & (np.asarray(layout.rows) < rows.size))
     assert 0 < len(found) < len(baked.depths.features)
+
+
+def test_rays_whose_segments_do_not_fit_are_left_out(rng):
+    baked = scenes_baked.baked()
+    batch, rates = batch_for(baked, rng), (jnp.float32(0.02), jnp.float32(0))
+    lit = int(jax.jit(partial(count_lit, config=CONFIG))(baked, batch))
+    enough = -(-lit // COUNT)
+    found = {}
+    for room in (1, enough, None):
+        one_step = jax.jit(partial(refine_step, config=CONFIG, lit_per_ray=room))
+        found[room] = one_step(init_refinement(baked), baked, batch, *rates)
+    assert enough > 1 and found[enough][1][1] == 0
+    # one buffer or the other: the same sums
+    close = partial(assert_allclose, rtol=1e-4, atol=1e-6)
+    jax.tree.map(close, found[enough][0].tables, found[None][0].tables)
+    assert 0.1 < found[1][1][1] < 1
+    share = 1 - float(found[1][1][1])
+    fitting = jax.tree.map(lambda x: x[: round(COUNT * share)], batch)
+    alone = step(init_refinement(baked), baked, fitting, *rates)
+    assert_allclose(found[1][1][0], share * alone[1][0], rtol=1e-5)  # a mean over all rays
 
 
 def test_a_step_needs_memory_for_a_batch_and_one_number_a_texel(rng):

@@ -38,7 +38,7 @@ from nimpostor_jax.train.bake import (
     solve_moments,
 )
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
-from nimpostor_jax.train.refine import init_refinement, refine_step, with_tables
+from nimpostor_jax.train.refine import count_lit, init_refinement, refine_step, with_tables
 from nimpostor_jax.train.sharding import device_mesh, over_rays, replicated, sums_by_device
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import BakedImpostor, Embedding, HashTables, NeuralImpostor, TetMesh
@@ -51,6 +51,7 @@ LOOK_RAYS, LOOKS_A_TET = 250_000, 20  # rays, at least, to find out what is visi
 DEPTHS_SHARE = 0.5  # of the rays: for how deep in the tets something lies
 FINAL_RATE = 0.1  # of the learning rate, at the end of the refinement
 DECODER_SHARE = 0.2  # of it
+LIT_MARGIN = 1.3  # of the segments that light reaches: batches differ, and textures change
 LOST_SHARE = 1e-3  # of the rays, above which it is reported that they do not fit
 
 
@@ -251,11 +252,15 @@ def refine(
     """
     if not config.refine_steps:
         return baked
-    compiled = jax.jit(partial(refine_step, config=render), donate_argnums=0)
+    key, found = jax.random.key(train.seed + 3), []
+    sample = draw_batch(key, 0, pool, train.rays_per_batch, "random")
+    lit = int(jax.jit(count_lit, static_argnames="config")(baked, sample, config=render))
+    room = math.ceil(LIT_MARGIN * lit / train.rays_per_batch) + 1
+    step = partial(refine_step, config=render, lit_per_ray=room)
+    compiled = jax.jit(step, donate_argnums=0)
     # Steps consume the state, and read the rest of `baked` beside it.
     state = init_refinement(dataclasses.replace(baked, decoders=jax.tree.map(jnp.copy, baked.decoders)))
     baked = with_tables(baked, {name: table[:0] for name, table in state.tables.items()})
-    key, found = jax.random.key(train.seed + 3), []
     for i in tqdm(range(config.refine_steps), desc="refine", unit="step", disable=None):
         batch = draw_batch(key, i, pool, train.rays_per_batch, "random")
         rate = config.learning_rate * FINAL_RATE ** (i / config.refine_steps)

@@ -79,24 +79,30 @@ def shade_segments(
 
 
 def lit_segments(
-    baked: BakedImpostor, segments: TetSegments, least: float
-) -> tuple[TetSegments, Float[Array, "N 4"], Int[Array, ""]]:
+    baked: BakedImpostor, segments: TetSegments, least: float, capacity: int | None = None
+) -> tuple[TetSegments, Float[Array, "M 4"], Int[Array, ""]]:
     """The segments that at least the share `least` of their rays' light reaches, packed; and their number.
 
     And the places on faces at which they look up what is seen. The others contribute less, and so does all
     that they hide: in `shade_segments` with that `min_weight` they change nothing, nor have they gradients.
+    Where they do not fit into `capacity` slots, by default as many as there were, the rays from the first
+    that is cut off on are flagged.
     """
     found = _look_along(baked, segments)
     light = transmittance(found.optical_depth, segments.rays, found.num_used)
-    tet_ids = segments.tet_ids[found.order]
-    lit, count = pack_where(
-        lambda _, item: (item[0] >= least) & (item[1] >= 0), None, (light, tet_ids), found.num_used
-    )
+    items = light, segments.tet_ids[found.order]
+    lit, count = pack_where(lambda _, part: (part[0] >= least) & (part[1] >= 0), None, items, found.num_used)
+    size = light.size if capacity is None else min(capacity, light.size)
+    overflow = segments.overflow
+    if size < light.size:
+        first_lost = jnp.where(count > size, segments.rays[found.order[lit[size]]], overflow.size)
+        overflow |= jnp.arange(overflow.size) >= first_lost
+        lit, count = lit[:size], jnp.minimum(count, size)
     columns = {name: getattr(segments, name) for name in ("rays", "tet_ids", *ENDS)}
     chosen = map_used(rows_of, found.order, lit, count)
     packed, places = map_used(rows_of, (columns, found.places), chosen, count)
-    packed["tet_ids"] = jnp.where(jnp.arange(light.size) < count, packed["tet_ids"], -1)
-    return dataclasses.replace(segments, **packed), places, count
+    packed["tet_ids"] = jnp.where(jnp.arange(size) < count, packed["tet_ids"], -1)
+    return dataclasses.replace(segments, **packed, overflow=overflow), places, count
 
 
 class _Along(NamedTuple):
