@@ -331,7 +331,7 @@ class BakeConfig:
     channels: int = 8  # that a texel keeps of the features, as the colour decoder takes them
     max_resolution: int = 256  # texels along an edge
     min_opacity: float = 2e-3  # of a tet, on average over the light that reaches it; less is left out
-    max_megabytes: int = 1024  # of textures; more is refused. Baking them may take 13 times as much
+    max_megabytes: int = 1024  # of textures; more is refused. Baking them may take 14 times as much
     fit_rays: int = 1_000_000
     novel_views: int = 300
     refine_steps: int = 3000
