@@ -69,7 +69,7 @@ def _problem(work: Work, interpolation: str) -> Problem:
         log2_tet_table=work.log2_table,
         init_scale=1.0,
     )
-    layout = build_layout(np.arange(4)[None], config)
+    layout = build_layout(np.eye(4, 3), np.arange(4)[None], config)
     features = init_features(jax.random.key(0), int(layout.starts[-1]), config)
     return Problem(
         config=config,

@@ -191,6 +191,15 @@ def test_table_size_is_clipped_and_can_be_set():
     assert EncodingConfig(log2_tet_table=5).tet_table_size(294) == 2**5
 
 
+@pytest.mark.parametrize(
+    "num_tets, budget",
+    [(6, 6 << 11), (294, 1 << 19), (2000, 1 << 19), (10_000, 10_000 << 8)],
+)
+def test_a_level_has_the_whole_budget_within_the_range_of_each_tet(num_tets, budget):
+    assert EncodingConfig().level_budget(num_tets) == budget
+    assert EncodingConfig(log2_tet_table=5).level_budget(num_tets) == num_tets << 5
+
+
 @given(st.integers(1, 10**6))
 def test_table_size_never_grows_with_the_mesh(num_tets):
     encoding = EncodingConfig()

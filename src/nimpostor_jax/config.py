@@ -97,8 +97,15 @@ class EncodingConfig:
         """Length of the concatenated feature vector f_p (L * F)."""
         return self.num_levels * self.features_per_level
 
+    def level_budget(self, num_tets: int) -> int:
+        """Entries of a level of all tets: 2**H, but from 2**min to 2**max for each tet (Sec. 3.3, 5.1)."""
+        if self.log2_tet_table is not None:
+            return num_tets << self.log2_tet_table
+        least, most = num_tets << self.min_log2_tet_table, num_tets << self.max_log2_tet_table
+        return min(max(1 << self.log2_table_size, least), most)
+
     def tet_table_size(self, num_tets: int) -> int:
-        """Entries 2**H' a tet and level (Sec. 3.3, corrected to stay in Sec. 5.1's range)."""
+        """Entries 2**H' a level of each tet's own table (Sec. 3.3, corrected to stay in Sec. 5.1's range)."""
         if self.log2_tet_table is not None:
             return 1 << self.log2_tet_table
         log2 = self.log2_table_size - math.floor(math.log2(num_tets) + 1)

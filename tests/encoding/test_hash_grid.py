@@ -30,8 +30,8 @@ def tables_of(layout, interpolation, mesh="delaunay", dtype="float64"):
     config = EncodingConfig(
         layout=layout, interpolation=interpolation, num_levels=LEVELS, growth=6.0, log2_tet_table=8
     )
-    _, tets = MESHES[mesh]()
-    hash_layout = build_layout(tets, config)
+    vertices, tets = MESHES[mesh]()
+    hash_layout = build_layout(vertices, tets, config)
     rng = np.random.default_rng(0)
     features = jnp.asarray(rng.normal(size=(int(hash_layout.starts[-1]), 2)), dtype)
     return config, tets, HashTables(features=features, layout=hash_layout)
@@ -140,7 +140,7 @@ def test_per_simplex_does_not_depend_on_how_tets_are_listed(interpolation, x64, 
     turn = turns[rng.integers(0, len(turns), len(tets))]
     shuffle = rng.permutation(len(tets))
     relisted = np.take_along_axis(tets, turn, axis=1)[shuffle]
-    layout = build_layout(relisted, config)
+    layout = build_layout(MESHES["delaunay"]()[0], relisted, config)
     assert_array_equal(layout.starts, tables.layout.starts)
 
     def canonical(tets, layout, features):
@@ -220,8 +220,8 @@ def test_gradients_are_finite_on_corners_edges_and_faces(interpolation):
 
 def test_all_levels_may_be_hashed(x64, rng):
     config = EncodingConfig(num_levels=2, base_resolution=20, log2_tet_table=4)
-    _, tets = MESHES["delaunay"]()
-    layout = build_layout(tets, config)
+    vertices, tets = MESHES["delaunay"]()
+    layout = build_layout(vertices, tets, config)
     assert len(layout.dense_ranks) == 0
     features = jnp.asarray(rng.normal(size=(int(layout.starts[-1]), 2)))
     ids, lambdas = random_points(tets, rng, 4)

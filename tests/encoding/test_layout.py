@@ -1,6 +1,7 @@
 """encoding.layout: who owns which table entry."""
 
 import itertools
+import math
 
 import numpy as np
 import oracles
@@ -34,9 +35,9 @@ def owner(layout_name, tet, corners, node):
 @pytest.mark.parametrize("layout_name, interpolation", KINDS)
 def test_regions_never_alias(layout_name, interpolation):
     """Each entry belongs to one sub-simplex, and all lie inside the table."""
-    _, tets = cube()
+    vertices, tets = cube()
     config = config_of(layout_name, interpolation, num_levels=4, log2_tet_table=8)
-    layout = build_layout(tets, config)
+    layout = build_layout(vertices, tets, config)
     order = np.asarray(layout.corner_order)
     for level, resolution in enumerate(config.resolutions):
         owners = {}
@@ -50,9 +51,9 @@ def test_regions_never_alias(layout_name, interpolation):
 
 @pytest.mark.parametrize("layout_name", ["per_simplex", "per_tet"])
 def test_packed_regions_are_disjoint_on_a_larger_mesh(layout_name):
-    _, tets = nonconvex()
+    vertices, tets = nonconvex()
     config = config_of(layout_name, "grid", num_levels=7)
-    layout = build_layout(tets, config)
+    layout = build_layout(vertices, tets, config)
     for level in range(7):
         regions = np.asarray(layout.regions[level])
         dense = oracles.is_dense(layout, level)
@@ -68,9 +69,9 @@ def test_packed_regions_are_disjoint_on_a_larger_mesh(layout_name):
 
 @pytest.mark.parametrize("layout_name, interpolation", KINDS)
 def test_dense_levels_are_collision_free_and_full(layout_name, interpolation):
-    _, tets = cube()
+    vertices, tets = cube()
     config = config_of(layout_name, interpolation, num_levels=3)
-    layout = build_layout(tets, config)
+    layout = build_layout(vertices, tets, config)
     order = np.asarray(layout.corner_order)
     dense = 0
     for level, resolution in enumerate(config.resolutions):
@@ -93,10 +94,10 @@ def test_dense_levels_are_collision_free_and_full(layout_name, interpolation):
 
 
 def test_neighbours_agree_on_the_nodes_of_their_common_face():
-    _, tets = delaunay(count=10)
+    vertices, tets = delaunay(count=10)
     for interpolation in ("grid", "simplex"):
         config = config_of("per_simplex", interpolation, num_levels=5, log2_tet_table=8)
-        layout = build_layout(tets, config)
+        layout = build_layout(vertices, tets, config)
         order = np.asarray(layout.corner_order)
         places = {}
         for level, resolution in enumerate(config.resolutions):
@@ -114,39 +115,78 @@ def test_neighbours_agree_on_the_nodes_of_their_common_face():
 @pytest.mark.parametrize("log2", [8, 11])
 def test_per_simplex_is_never_larger_than_per_tet(make, interpolation, log2):
     """At the paper's table sizes (Sec. 5.1): levels may grow with the resolution, never over the budget."""
-    _, tets = make()
+    vertices, tets = make()
     sizes = {}
     for name in ("per_simplex", "per_tet"):
         config = config_of(name, interpolation, num_levels=16, log2_tet_table=log2)
-        sizes[name] = np.diff(build_layout(tets, config).starts)
+        sizes[name] = np.diff(build_layout(vertices, tets, config).starts)
     budget = len(tets) << log2
     assert max(sizes["per_simplex"]) <= budget
     assert max(sizes["per_tet"]) <= budget
     assert sum(sizes["per_simplex"]) <= sum(sizes["per_tet"])
 
 
-def test_hashed_levels_use_the_budget():
-    """A limit that is respected by storing nothing would be worthless."""
-    _, tets = nonconvex()
-    entries = np.diff(
-        build_layout(tets, config_of("per_simplex", "grid", num_levels=14, log2_tet_table=8)).starts
-    )
-    assert entries[-1] > 0.4 * (len(tets) << 8)  # sizes are powers of two
+def hashed_regions(vertices, tets, config):
+    """Size of each sub-simplex' region at the finest level, its dimension, and its tets' largest area."""
+    layout = build_layout(vertices, tets, config)
+    areas = np.abs(np.linalg.det(np.diff(vertices[tets], axis=1))) ** (2 / 3)
+    found = {}
+    for regions, area in zip(np.asarray(layout.regions[-1]), areas, strict=True):
+        for mask in range(1, 16):
+            offset, size = regions[mask] >> SIZE_BITS, 1 << (regions[mask] % (1 << SIZE_BITS))
+            _, _, most = found.get(offset, (0, 0, 0.0))
+            found[offset] = size, mask.bit_count() - 1, max(most, area)
+    return layout, *(np.array(column) for column in zip(*found.values(), strict=True))
+
+
+@pytest.mark.parametrize("make", [cube, delaunay, nonconvex])
+def test_hashed_levels_use_the_budget(make):
+    """Regions double one by one: what remains is less than one doubling."""
+    vertices, tets = make()
+    config = config_of("per_simplex", "simplex", num_levels=7, growth=2.0, log2_tet_table=9)
+    layout, sizes, _, _ = hashed_regions(vertices, tets, config)
+    entries = int(layout.starts[-1] - layout.starts[-2])
+    assert 1 + sizes.sum() == entries
+    assert 0 <= config.level_budget(len(tets)) - entries < sizes.max()
+
+
+@pytest.mark.parametrize("log2", [4, 9])
+def test_regions_are_as_large_as_tets_look(log2):
+    """Nodes times area for each entry differ by a factor of 2, except where each node has its own entry.
+
+    Areas of the cage's tets differ by a factor of 48: with regions of one size demand would, too.
+    """
+    vertices, tets = delaunay(count=40)
+    config = config_of("per_simplex", "simplex", num_levels=6, growth=2.0, log2_tet_table=log2)
+    _, sizes, dimensions, areas = hashed_regions(vertices, tets, config)
+    nodes = np.array([math.comb(config.resolutions[-1] - 1, d) for d in range(4)])[dimensions]
+    assert np.all(sizes < 2 * nodes)
+    demand = nodes * areas / sizes
+    crowded, shrinkable = sizes < nodes, sizes > 1
+    assert crowded.sum() > len(tets)
+    assert demand[crowded].max() <= 2 * demand[shrinkable].min() * (1 + 1e-9)  # rounding of areas
+
+
+def test_sizes_do_not_depend_on_the_unit_of_length():
+    vertices, tets = delaunay(count=40)
+    config = config_of("per_simplex", "simplex", num_levels=9)
+    expected = build_layout(vertices, tets, config).regions
+    assert_array_equal(build_layout(1024 * vertices, tets, config).regions, expected)
 
 
 def test_offsets_that_do_not_fit_their_integers_are_refused():
-    _, tets = nonconvex()
+    vertices, tets = nonconvex()
     config = config_of("per_tet", "grid", num_levels=14, log2_tet_table=20)
     with pytest.raises(ValueError, match="entries"):
-        build_layout(np.tile(tets, (3, 1)), config)
+        build_layout(vertices, np.tile(tets, (3, 1)), config)
 
 
 def test_corner_order_sorts_by_vertex_id():
-    _, tets = delaunay(count=12)
-    layout = build_layout(tets, config_of("per_simplex", "grid"))
+    vertices, tets = delaunay(count=12)
+    layout = build_layout(vertices, tets, config_of("per_simplex", "grid"))
     ordered = np.take_along_axis(tets, np.asarray(layout.corner_order), axis=1)
     assert np.all(np.diff(ordered, axis=1) > 0)
-    layout = build_layout(tets, config_of("per_tet", "grid"))
+    layout = build_layout(vertices, tets, config_of("per_tet", "grid"))
     assert_array_equal(layout.corner_order, np.broadcast_to(np.arange(4), tets.shape))
 
 

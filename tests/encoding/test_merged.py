@@ -27,7 +27,7 @@ merged_jit = jax.jit(encode_merged, static_argnames="config")
 
 
 def tables_of(config, dtype, mesh="delaunay", layout=None):
-    layout = build_layout(MESHES[mesh]()[1], config) if layout is None else layout
+    layout = build_layout(*MESHES[mesh](), config) if layout is None else layout
     features = np.random.default_rng(0).normal(size=(int(layout.starts[-1]), config.features_per_level))
     return HashTables(features=jnp.asarray(features, dtype), layout=layout)
 
@@ -78,8 +78,8 @@ def test_finer_levels_that_do_not_fit_stay_as_they_are(growth, levels, x64):
 
 def test_joined_layouts_with_mixed_levels(x64):
     """Dense in the small mesh, hashed in the large one."""
-    small = build_layout(MESHES["delaunay"]()[1], dataclasses.replace(CONFIG, log2_tet_table=9))
-    large = build_layout(MESHES["delaunay"]()[1], CONFIG)
+    small = build_layout(*MESHES["delaunay"](), dataclasses.replace(CONFIG, log2_tet_table=9))
+    large = build_layout(*MESHES["delaunay"](), CONFIG)
     tables = tables_of(CONFIG, "float64", layout=join_layouts([small, large]))
     assert tables.layout.num_mixed
     for megabytes in (64, 0.5):

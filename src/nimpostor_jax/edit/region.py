@@ -57,7 +57,7 @@ def with_region(
     if alone:
         num_cells, index = 0, index[:0]
     if len(changed):
-        own = build_layout(np.asarray(mesh.tets)[changed], field.config.encoding)
+        own = build_layout(np.asarray(mesh.vertices), np.asarray(mesh.tets)[changed], field.config.encoding)
         layouts = [own] if alone else [layout, own]
         layout = own if alone else join_layouts(layouts)
         features, entries = _own_entries(None if alone else field.tables, own, layout, features)

@@ -7,7 +7,7 @@ tet on which it lies. `per_tet` gives all masks of a tet one region (the paper's
 one to each sub-simplex of the mesh, which all tets around it share: the field is then continuous.
 
 Nodes of a level that fit are numbered without collisions (`dense_ranks`); otherwise they are hashed within
-their region. Host code, NumPy.
+their region. A sub-simplex' region is the larger, the larger the tets around it are. Host code, NumPy.
 """
 
 import itertools
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from nimpostor_jax.config import EncodingConfig
 from nimpostor_jax.types import HashLayout
@@ -36,9 +36,11 @@ def slab_half_width(config: EncodingConfig) -> int:
     return 3 if config.interpolation == "grid" else 0
 
 
-def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> HashLayout:
-    """The layout for a mesh's tets. Raises ValueError where entries cannot be addressed in 32 bits."""
-    tets = np.asarray(tets)
+def build_layout(
+    vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"], config: EncodingConfig
+) -> HashLayout:
+    """The layout for a mesh at rest. Raises ValueError where entries cannot be addressed in 32 bits."""
+    vertices, tets = np.asarray(vertices, np.float64), np.asarray(tets)
     if config.layout == "per_tet":
         regions, entries, ranks = _per_tet(len(tets), config)
         multipliers = np.broadcast_to(np.array(NGP_PRIMES, np.uint32), tets.shape)
@@ -46,7 +48,7 @@ def build_layout(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> HashLa
     else:
         order = np.argsort(tets, axis=1)
         ascending = np.take_along_axis(tets, order, axis=1)
-        regions, entries, ranks = _per_simplex(ascending, config)
+        regions, entries, ranks = _per_simplex(vertices, ascending, config)
         multipliers = _vertex_multipliers(ascending)
     _check_addresses(entries, len(tets))
     dense = [rank for rank in ranks if rank is not None]  # the coarsest levels: nodes grow with them
@@ -123,61 +125,72 @@ def _per_tet(num_tets: int, config: EncodingConfig) -> tuple[list, list, list]:
     return regions, entries, ranks
 
 
-def _per_simplex(tets: Int[np.ndarray, "T 4"], config: EncodingConfig) -> tuple[list, list, list]:
-    """Regions [T, 16] by mask. Each level gets at most the entries that `per_tet` would have."""
+def _per_simplex(
+    vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"], config: EncodingConfig
+) -> tuple[list, list, list]:
+    """Regions [T, 16] by mask, sub-simplices numbered by dimension. A level has the budget at most."""
     ids, counts = _sub_simplices(tets)
-    budget = len(tets) * config.tet_table_size(len(tets))
+    areas = _areas_around(vertices, tets, ids, sum(counts))
+    dimensions = np.repeat(np.arange(4), counts)
+    budget = config.level_budget(len(tets))
     regions, entries, ranks = [], [], []
     for resolution in config.resolutions:
-        nodes = _nodes_by_dimension(resolution, slab_half_width(config))
+        by_dimension = _nodes_by_dimension(resolution, slab_half_width(config))
+        nodes = np.array(by_dimension, np.float64)[dimensions]
         rank = _dense_ranks(resolution, slab_half_width(config), by_mask=True)
-        if rank is not None and 1 + sum(n * c for n, c in zip(nodes, counts, strict=True)) <= budget:
-            sizes, log2 = nodes, [0] * 4
+        if rank is not None and 1 + nodes.sum() <= budget:
+            log2, sizes = np.zeros(len(nodes), np.int64), nodes.astype(np.int64)
         else:
-            rank = None
-            log2 = _hashed_sizes(nodes, counts, budget)
-            sizes = [1 << bits for bits in log2]
-        bases = np.concatenate([[1], 1 + np.cumsum([s * c for s, c in zip(sizes, counts, strict=True)])])
-        packed = np.zeros((len(tets), 16), np.int64)  # mask 0, the all-zero node, is entry 0 of the level
-        for mask in range(1, 16):
-            dimension = mask.bit_count() - 1
-            offset = bases[dimension] + ids[:, mask] * sizes[dimension]
-            packed[:, mask] = offset << SIZE_BITS | log2[dimension]
+            rank, log2 = None, _hashed_sizes(nodes, nodes * areas, budget - 1)
+            sizes = np.int64(1) << log2
+        offsets = 1 + np.cumsum(sizes) - sizes  # entry 0 of the level is the all-zero node's, mask 0
+        packed = np.zeros((len(tets), 16), np.int64)
+        packed[:, 1:] = (offsets << SIZE_BITS | log2)[ids[:, 1:]]
         regions.append(packed)
-        entries.append(int(bases[-1]))
+        entries.append(int(1 + sizes.sum()))
         ranks.append(rank)
     return regions, entries, ranks
 
 
-def _hashed_sizes(nodes: list[int], counts: list[int], budget: int) -> list[int]:
-    """log2 of the region size of a vertex, edge, face and tet: as large as the budget allows.
+def _areas_around(
+    vertices: Float[np.ndarray, "V 3"],
+    tets: Int[np.ndarray, "T 4"],
+    ids: Int[np.ndarray, "T 16"],
+    count: int,
+) -> Float[np.ndarray, " S"]:
+    """How large the largest tet around each sub-simplex looks: its volume**(2/3)."""
+    corners = vertices[tets]
+    areas = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) ** (2 / 3)
+    largest = np.zeros(count)
+    np.maximum.at(largest, ids[:, 1:], areas[:, None])
+    return largest
 
-    A sub-simplex never gets more than its nodes need. Sizes grow in turn, always the one whose nodes
-    collide most, so that features are about equally shared everywhere.
+
+def _hashed_sizes(
+    nodes: Float[np.ndarray, " S"], demand: Float[np.ndarray, " S"], budget: int
+) -> Int[np.ndarray, " S"]:
+    """log2 of each region's size: all double in turn, always the one with most demand for its size.
+
+    None gets more than its nodes need, and together they have the budget at most, or one entry each.
     """
-    log2 = [min(2, max(0, (n - 1).bit_length())) for n in nodes]
-    growing = {0, 1, 2, 3}
-    while growing:
-        crowded = max(growing, key=lambda d: nodes[d] / (1 << log2[d]))
-        grown = [bits + (d == crowded) for d, bits in enumerate(log2)]
-        total = 1 + sum(c << bits for c, bits in zip(counts, grown, strict=True))
-        if nodes[crowded] <= 1 << log2[crowded] or total > budget:
-            growing.remove(crowded)
-        else:
-            log2 = grown
-    return log2
+    needed = np.ceil(np.log2(np.maximum(nodes, 1))).astype(np.int64)  # doublings of a single entry
+    which = np.repeat(np.arange(len(nodes)), needed)
+    doublings = np.arange(len(which)) - np.repeat(np.cumsum(needed) - needed, needed)
+    turns = np.argsort(-demand[which] / 2.0**doublings, kind="stable")
+    used = len(nodes) + np.cumsum(np.int64(1) << doublings[turns])
+    return np.bincount(which[turns[used <= budget]], minlength=len(nodes))
 
 
 def _sub_simplices(tets: Int[np.ndarray, "T 4"]) -> tuple[Int[np.ndarray, "T 16"], list[int]]:
-    """The number of each tet's sub-simplex among all of its dimension, by mask, and how many there are."""
+    """The number of each tet's sub-simplex by mask, vertices first, and how many each dimension has."""
     ids = np.zeros((len(tets), 16), np.int64)
-    counts = []
+    counts: list[int] = []
     for size in range(1, 5):
         masks = [sum(1 << i for i in corners) for corners in itertools.combinations(range(4), size)]
         corners = [list(c) for c in itertools.combinations(range(4), size)]
         simplices = np.stack([tets[:, c] for c in corners], axis=1).reshape(-1, size)
         unique, inverse = np.unique(simplices, axis=0, return_inverse=True)
-        ids[:, masks] = inverse.reshape(len(tets), len(masks))
+        ids[:, masks] = sum(counts) + inverse.reshape(len(tets), len(masks))
         counts.append(len(unique))
     return ids, counts
 

@@ -39,7 +39,7 @@ def init_impostor(key: Array, mesh: TetMesh, config: ImpostorConfig) -> NeuralIm
     layout: HashLayout | BoxLayout = (
         build_box_layout(np.asarray(mesh.vertices), tets, config.encoding)
         if config.encoding.layout == "box"
-        else build_layout(tets, config.encoding)
+        else build_layout(np.asarray(mesh.vertices), tets, config.encoding)
     )
     num_entries = int(layout.starts[-1])
     return NeuralImpostor(
