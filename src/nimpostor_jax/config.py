@@ -43,9 +43,7 @@ class EncodingConfig:
     log2_table_size: int = 19  # H, the whole mesh's budget a level
     min_log2_tet_table: int = 8
     max_log2_tet_table: int = 11
-    log2_tet_table: int | None = (
-        None  # overrides the rule H' = clip(H - floor(log2 T + 1), min, max)
-    )
+    log2_tet_table: int | None = None  # H' of each tet, in the place of the three above
     init_scale: float = 1e-2
 
     def __post_init__(self) -> None:
