@@ -114,7 +114,7 @@ def test_neighbours_agree_on_the_nodes_of_their_common_face():
 @pytest.mark.parametrize("make", [one_tet, cube, delaunay, nonconvex])
 @pytest.mark.parametrize("log2", [8, 11])
 def test_per_simplex_is_never_larger_than_per_tet(make, interpolation, log2):
-    """At the paper's table sizes (Sec. 5.1): levels may grow with the resolution, never over the budget."""
+    """At the same H' (Sec. 5.1's range): levels may grow with the resolution, never over the budget."""
     vertices, tets = make()
     sizes = {}
     for name in ("per_simplex", "per_tet"):
@@ -127,44 +127,84 @@ def test_per_simplex_is_never_larger_than_per_tet(make, interpolation, log2):
 
 
 def hashed_regions(vertices, tets, config):
-    """Size of each sub-simplex' region at the finest level, its dimension, and its tets' largest area."""
+    """Entries of the finest level, and the size of each sub-simplex' region, by its vertices."""
     layout = build_layout(vertices, tets, config)
-    areas = np.abs(np.linalg.det(np.diff(vertices[tets], axis=1))) ** (2 / 3)
+    order = np.asarray(layout.corner_order)
     found = {}
-    for regions, area in zip(np.asarray(layout.regions[-1]), areas, strict=True):
+    for tet, regions in enumerate(np.asarray(layout.regions[-1])):
+        corners = tets[tet][order[tet]]
         for mask in range(1, 16):
-            offset, size = regions[mask] >> SIZE_BITS, 1 << (regions[mask] % (1 << SIZE_BITS))
-            _, _, most = found.get(offset, (0, 0, 0.0))
-            found[offset] = size, mask.bit_count() - 1, max(most, area)
-    return layout, *(np.array(column) for column in zip(*found.values(), strict=True))
+            key = tuple(int(corners[i]) for i in range(4) if mask >> i & 1)
+            assert found.setdefault(key, regions[mask]) == regions[mask]
+    sizes = {key: 1 << int(region % (1 << SIZE_BITS)) for key, region in found.items()}
+    return int(layout.starts[-1] - layout.starts[-2]), sizes
 
 
-@pytest.mark.parametrize("make", [cube, delaunay, nonconvex])
-def test_hashed_levels_use_the_budget(make):
-    """Regions double one by one: what remains is less than one doubling."""
-    vertices, tets = make()
-    config = config_of("per_simplex", "simplex", num_levels=7, growth=2.0, log2_tet_table=9)
-    layout, sizes, _, _ = hashed_regions(vertices, tets, config)
-    entries = int(layout.starts[-1] - layout.starts[-2])
-    assert 1 + sizes.sum() == entries
-    assert 0 <= config.level_budget(len(tets)) - entries < sizes.max()
+def doubled_in_turn(vertices, tets, resolution, budget):
+    """Sizes by vertices: always the region with most nodes times area for each entry, while it fits."""
+    volumes = np.abs(np.linalg.det(np.diff(vertices[tets], axis=1)))
+    areas = np.maximum(volumes ** (2 / 3), np.median(volumes ** (2 / 3)) / 16).astype(np.float32)
+    nodes, demand = {}, {}
+    for tet, area in zip(tets.tolist(), areas.tolist(), strict=True):
+        for size in range(1, 5):
+            for key in itertools.combinations(sorted(tet), size):
+                nodes[key] = math.comb(resolution - 1, size - 1)
+                demand[key] = max(demand.get(key, 0), nodes[key] * area)
+    sizes, left = dict.fromkeys(nodes, 1), budget - 1 - len(nodes)
+    growing = sorted(nodes, key=lambda key: (len(key), key))  # of equal ones the first
+    while growing:
+        key = max(growing, key=lambda key: demand[key] / sizes[key])
+        if sizes[key] >= nodes[key] or sizes[key] > left:
+            growing.remove(key)
+        else:
+            left -= sizes[key]
+            sizes[key] *= 2
+    return sizes
 
 
-@pytest.mark.parametrize("log2", [4, 9])
-def test_regions_are_as_large_as_tets_look(log2):
-    """Nodes times area for each entry differ by a factor of 2, except where each node has its own entry.
-
-    Areas of the cage's tets differ by a factor of 48: with regions of one size demand would, too.
-    """
+@pytest.mark.parametrize(
+    "rule",
+    [
+        {"log2_tet_table": 3},
+        {"log2_tet_table": 9},
+        {"log2_table_size": 14, "min_log2_tet_table": 1},  # 96 entries for each of 170 tets
+        {"log2_table_size": 9, "min_log2_tet_table": 1},  # not one for each sub-simplex
+    ],
+)
+def test_regions_double_where_there_is_most_to_keep_for_each_entry(rule):
+    """Areas of the cage's tets differ by a factor of 48."""
     vertices, tets = delaunay(count=40)
-    config = config_of("per_simplex", "simplex", num_levels=6, growth=2.0, log2_tet_table=log2)
-    _, sizes, dimensions, areas = hashed_regions(vertices, tets, config)
-    nodes = np.array([math.comb(config.resolutions[-1] - 1, d) for d in range(4)])[dimensions]
-    assert np.all(sizes < 2 * nodes)
-    demand = nodes * areas / sizes
-    crowded, shrinkable = sizes < nodes, sizes > 1
-    assert crowded.sum() > len(tets)
-    assert demand[crowded].max() <= 2 * demand[shrinkable].min() * (1 + 1e-9)  # rounding of areas
+    config = config_of("per_simplex", "simplex", num_levels=6, growth=2.0, **rule)
+    entries, sizes = hashed_regions(vertices, tets, config)
+    budget = config.level_budget(len(tets))
+    assert sizes == doubled_in_turn(vertices, tets, config.resolutions[-1], budget)
+    assert entries == 1 + sum(sizes.values())
+    assert entries <= max(budget, 1 + len(sizes))
+
+
+@pytest.mark.parametrize("make", [one_tet, cube, delaunay, nonconvex])
+@pytest.mark.parametrize(
+    "rule", [{"log2_tet_table": 9}, {"log2_table_size": 11, "min_log2_tet_table": 4}]
+)
+def test_hashed_levels_use_the_budget(make, rule):
+    """A limit that is respected by storing nothing would be worthless."""
+    vertices, tets = make()
+    config = config_of("per_simplex", "simplex", num_levels=8, growth=2.0, **rule)
+    entries, _ = hashed_regions(vertices, tets, config)
+    budget = config.level_budget(len(tets))
+    assert 0.97 * budget < entries <= budget  # a single tet has too few regions to use all of it
+    assert len(tets) == 1 or entries == budget
+
+
+def test_flat_tets_have_tables():
+    """As if their area were a sixteenth of the median."""
+    vertices, tets = delaunay(count=40)
+    flat = vertices.copy()
+    flat[tets[0, 0]] = vertices[tets[0, 1:]].mean(axis=0)
+    config = config_of("per_simplex", "simplex", num_levels=6, growth=2.0, log2_tet_table=9)
+    _, sizes = hashed_regions(flat, tets, config)
+    inside = np.array([sizes[tuple(sorted(tet))] for tet in tets.tolist()])
+    assert inside[0] >= np.median(inside) / 32  # sizes are powers of two
 
 
 def test_sizes_do_not_depend_on_the_unit_of_length():

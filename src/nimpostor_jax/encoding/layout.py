@@ -39,7 +39,10 @@ def slab_half_width(config: EncodingConfig) -> int:
 def build_layout(
     vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"], config: EncodingConfig
 ) -> HashLayout:
-    """The layout for a mesh at rest. Raises ValueError where entries cannot be addressed in 32 bits."""
+    """The layout for a mesh, in the pose in which its field is trained: only proportions of volumes matter.
+
+    Raises ValueError where entries cannot be addressed in 32 bits. Host code.
+    """
     vertices, tets = np.asarray(vertices, np.float64), np.asarray(tets)
     if config.layout == "per_tet":
         regions, entries, ranks = _per_tet(len(tets), config)
@@ -68,7 +71,7 @@ def _check_addresses(entries: list[int], num_tets: int) -> None:
         raise ValueError(
             f"{sum(entries):,} table entries for {num_tets} tets, {max(entries):,} of them in one level, "
             f"cannot be addressed (2**31, and 2**{31 - SIZE_BITS} a level); "
-            "lower EncodingConfig.min_log2_tet_table or log2_tet_table"
+            "lower EncodingConfig.log2_table_size, its limits a tet, or log2_tet_table"
         )
 
 
@@ -128,7 +131,7 @@ def _per_tet(num_tets: int, config: EncodingConfig) -> tuple[list, list, list]:
 def _per_simplex(
     vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"], config: EncodingConfig
 ) -> tuple[list, list, list]:
-    """Regions [T, 16] by mask, sub-simplices numbered by dimension. A level has the budget at most."""
+    """Regions [T, 16] by mask. A level has the budget at most, but an entry for each sub-simplex."""
     ids, counts = _sub_simplices(tets)
     areas = _areas_around(vertices, tets, ids, sum(counts))
     dimensions = np.repeat(np.arange(4), counts)
@@ -158,9 +161,14 @@ def _areas_around(
     ids: Int[np.ndarray, "T 16"],
     count: int,
 ) -> Float[np.ndarray, " S"]:
-    """How large the largest tet around each sub-simplex looks: its volume**(2/3)."""
+    """How large the largest tet around each sub-simplex looks: its volume**(2/3).
+
+    A sixteenth of the median at least, so that flat tets have tables, too. Rounded, so that congruent tets
+    are equal, and in the same order, on every machine.
+    """
     corners = vertices[tets]
     areas = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1])) ** (2 / 3)
+    areas = np.maximum(areas, np.median(areas) / 16).astype(np.float32)
     largest = np.zeros(count)
     np.maximum.at(largest, ids[:, 1:], areas[:, None])
     return largest
@@ -169,16 +177,24 @@ def _areas_around(
 def _hashed_sizes(
     nodes: Float[np.ndarray, " S"], demand: Float[np.ndarray, " S"], budget: int
 ) -> Int[np.ndarray, " S"]:
-    """log2 of each region's size: all double in turn, always the one with most demand for its size.
+    """log2 of each region's size: they double in turn, always the one with most demand for each entry.
 
-    None gets more than its nodes need, and together they have the budget at most, or one entry each.
+    None gets more than its nodes need, and together they have the budget at most, or one entry each. A region
+    whose doubling does not fit any more stays as it is; smaller ones may go on.
     """
     needed = np.ceil(np.log2(np.maximum(nodes, 1))).astype(np.int64)  # doublings of a single entry
     which = np.repeat(np.arange(len(nodes)), needed)
     doublings = np.arange(len(which)) - np.repeat(np.cumsum(needed) - needed, needed)
     turns = np.argsort(-demand[which] / 2.0**doublings, kind="stable")
-    used = len(nodes) + np.cumsum(np.int64(1) << doublings[turns])
-    return np.bincount(which[turns[used <= budget]], minlength=len(nodes))
+    costs = np.int64(1) << doublings[turns]
+    left = budget - len(nodes) - np.cumsum(costs)  # after each turn
+    fits = left >= 0
+    spare = int(left[fits][-1]) if fits.any() else budget - len(nodes)
+    for turn in np.flatnonzero(~fits & (costs <= spare)):
+        if costs[turn] <= spare:
+            fits[turn] = True
+            spare -= costs[turn]
+    return np.bincount(which[turns[fits]], minlength=len(nodes))
 
 
 def _sub_simplices(tets: Int[np.ndarray, "T 4"]) -> tuple[Int[np.ndarray, "T 16"], list[int]]:
