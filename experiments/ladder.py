@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from nimpostor_jax.config import ExperimentConfig
@@ -117,6 +118,7 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
     with atomic_path(settings) as path:
         path.write_text(text, encoding="utf-8")
     write_json(row_file, row)
+    forget_programs()
     return Trained(scene, impostor, row)
 
 
@@ -157,7 +159,16 @@ def bake_or_reuse(trained: Trained, workdir: Path) -> tuple[BakedImpostor, Row]:
     with atomic_path(settings) as path:
         path.write_text(text, encoding="utf-8")
     write_json(row_file, row)
+    forget_programs()
     return baked, row
+
+
+def forget_programs() -> None:
+    """Free what was compiled for a row: it is thousands of memory maps, of which Linux allows 65,530.
+
+    Beyond, compiling ends the process, as that of a ladder's fifth row once did.
+    """
+    jax.clear_caches()
 
 
 def seconds_to(curve: Sequence[tuple[float, float]], target: float) -> float | None:
