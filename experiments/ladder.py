@@ -13,7 +13,8 @@ import numpy as np
 from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.gin_flags import load_config, operative_config_text
 from nimpostor_jax.io.atomic import atomic_path
-from nimpostor_jax.io.images import composite, write_png
+from nimpostor_jax.io.blender import PosedImages
+from nimpostor_jax.io.images import composite, read_image, write_png
 from nimpostor_jax.io.impostor_file import load_baked, load_impostor, save_impostor
 from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.bake import bake
@@ -182,15 +183,13 @@ def seconds_to(curve: Sequence[tuple[float, float]], target: float) -> float | N
     return None
 
 
-def write_picture(path: Path, trained: Sequence[Trained]) -> None:
-    """The first held-out view: truth, then every method."""
-    views = trained[0].scene.test
-    camera, behind = camera_of(views, 0), views.background(0, "white")
-    images = [composite(views.images[0], behind)]
-    for each in trained:
-        sized = frame_config(each.impostor, camera, each.scene.config.render)
-        images.append(composite_frame(render_frame(each.impostor, camera, sized), behind))
-    write_png(path, np.concatenate(images, axis=1))
+def write_picture(path: Path, views: PosedImages, folders: Sequence[Path]) -> None:
+    """The first held-out view, from the pictures in the runs' folders: truth, then every method."""
+    name = f"{Path(views.names[0]).stem}.png"
+    panels = [read_image(folder / "pictures" / name)[0][..., :3] for folder in folders]
+    truth = panels[0][:, : views.width]
+    renders = [panel[:, views.width : 2 * views.width] for panel in panels]
+    write_png(path, np.concatenate([truth, *renders], axis=1))
 
 
 def write_table(out: Path, rows: Sequence[Row], columns: Sequence[str], notes: str) -> None:

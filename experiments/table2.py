@@ -85,7 +85,8 @@ def main(argv: Sequence[str]) -> None:
                 baked, row = bake_or_reuse(source, folder / f"{resolution}" / "Baked")
                 trained.append(source._replace(impostor=baked, row=row))
             rows += compared(trained)
-            write_picture(folder / f"{resolution}.png", trained)
+            runs = [folder / f"{resolution}" / each.row["method"] for each in trained]
+            write_picture(folder / f"{resolution}.png", trained[0].scene.test, runs)
             write_table(args.out / "table2", rows, COLUMNS, notes(rows))
 
 
