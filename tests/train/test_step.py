@@ -72,6 +72,12 @@ def stepper(gradient=loss_gradient):
     return jax.jit(chex.assert_max_traces(step, n=1))
 
 
+@pytest.fixture(autouse=True, scope="module")
+def new_steps():
+    """xdist may take a worker away from this module and back: conftest has freed its programs in between."""
+    stepper.cache_clear()
+
+
 def run(steps):
     impostor, batch = scene()
     state, losses = init_state(impostor, OPTIMIZER, cells_per_edge=4), []
