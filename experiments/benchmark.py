@@ -42,7 +42,7 @@ from nimpostor_jax.render.sampling import plan_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
 from nimpostor_jax.train.pool import draw_batch
-from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.sharding import data_parallel, device_mesh, dividing_devices, over_rays, replicated
 from nimpostor_jax.train.step import init_state, make_optimizer, train_step
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays
 
@@ -189,8 +189,7 @@ def time_training(
     if trained is not None and trained.config.encoding == encoding:
         impostor = trained
     optimizer = make_optimizer()
-    devices = jax.local_devices()
-    mesh = device_mesh(devices)
+    mesh = device_mesh(dividing_devices(config.train.rays_per_batch))
     state = jax.device_put(init_state(impostor, optimizer, config.train.cells_per_edge), replicated(mesh))
     frozen, pool = jax.device_put((impostor, scene.pool), replicated(mesh))
     gradient = data_parallel(mesh)

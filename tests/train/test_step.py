@@ -21,7 +21,7 @@ from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import march_tables, traverse
 from nimpostor_jax.train.losses import photometric
-from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.sharding import data_parallel, device_mesh, dividing_devices, over_rays, replicated
 from nimpostor_jax.train.step import (
     RayBatch,
     init_state,
@@ -197,6 +197,15 @@ def test_two_devices_give_the_step_of_one():
     assert_array_equal(single.last_seen, double.last_seen)
     for a, b in zip(jax.tree.leaves(single.optimizer), jax.tree.leaves(double.optimizer), strict=True):
         assert_allclose(b, a, rtol=1e-4, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "rays, cores, most, expected",
+    [(4096, 16, None, 16), (4096, 12, None, 8), (4096, 6, 3, 2), (1001, 4, None, 1)],
+)
+def test_a_batch_is_shared_evenly_by_as_many_devices_as_can(rays, cores, most, expected):
+    devices = [object() for _ in range(cores)]
+    assert list(dividing_devices(rays, at_most=most, devices=devices)) == devices[:expected]
 
 
 def test_the_loss_is_that_of_the_blended_colours():

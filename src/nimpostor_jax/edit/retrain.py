@@ -38,7 +38,14 @@ from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import PixelPool, draw_batch
-from nimpostor_jax.train.sharding import AXIS, data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.sharding import (
+    AXIS,
+    data_parallel,
+    device_mesh,
+    dividing_devices,
+    over_rays,
+    replicated,
+)
 from nimpostor_jax.train.step import (
     Metrics,
     Parameters,
@@ -147,8 +154,8 @@ def _render_stage(
     sized = dataclasses.replace(render, march=march)
     sized = fit_capacities(new.mesh, jax.jit(march_tables)(new.mesh), probe.rays, sized)
     gradient, place = loss_gradient, (lambda batch: batch)
-    devices = jax.local_devices()
-    if len(devices) > 1 and config.rays_per_batch % len(devices) == 0:
+    devices = dividing_devices(config.rays_per_batch)
+    if len(devices) > 1:
         mesh = device_mesh(devices)
         state, new, region, pool = jax.device_put((state, new, region, pool), replicated(mesh))
         gradient, place = data_parallel(mesh), partial(jax.device_put, device=over_rays(mesh))

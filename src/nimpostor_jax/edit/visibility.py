@@ -26,7 +26,7 @@ from nimpostor_jax.render.renderer import render_samples
 from nimpostor_jax.render.selection import optical_weights, sample_densities
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import PixelPool, draw_batch
-from nimpostor_jax.train.sharding import device_mesh, over_rays, replicated, sums_by_device
+from nimpostor_jax.train.sharding import device_mesh, dividing_devices, over_rays, replicated, sums_by_device
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
@@ -63,8 +63,7 @@ def seen_parts(
     tets = region.tets if region.sources is None else region.sources
     rows = np.full(len((new if region.sources is None else old).mesh.tets), region.tets.size, np.int32)
     rows[np.asarray(tets)] = np.arange(region.tets.size)
-    devices = jax.local_devices()
-    mesh = device_mesh(devices if size % len(devices) == 0 else devices[:1])
+    mesh = device_mesh(dividing_devices(size))
     shared = jax.device_put((old, target, jnp.asarray(rows)), replicated(mesh))
     seen = jnp.zeros((mesh.size, region.tets.size, new.occupied.shape[1]), new.mesh.vertices.dtype)
     seen = jax.device_put(seen, over_rays(mesh))

@@ -39,7 +39,7 @@ from nimpostor_jax.train.bake import (
 )
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
 from nimpostor_jax.train.refine import count_lit, init_refinement, refine_step, with_tables
-from nimpostor_jax.train.sharding import device_mesh, over_rays, replicated, sums_by_device
+from nimpostor_jax.train.sharding import device_mesh, dividing_devices, over_rays, replicated, sums_by_device
 from nimpostor_jax.train.step import RayBatch
 from nimpostor_jax.types import BakedImpostor, Embedding, HashTables, NeuralImpostor, TetMesh
 
@@ -126,7 +126,8 @@ class TrainingRays:
         pool, _ = build_pool(mesh, views.cameras, views.images, config.march, views.backgrounds)
         key, size = jax.random.key(seed), min(FIT_RAYS, count)
         sized = fit_config(mesh, pool, draw_batch(key, 0, pool, size, "white"), config)
-        return TrainingRays(pool, key, count, size, sized, device_mesh(fit_devices(size)))
+        devices = dividing_devices(size, at_most=FIT_DEVICES)
+        return TrainingRays(pool, key, count, size, sized, device_mesh(devices))
 
     def add_up(
         self, start: Callable[[], Any], add: Callable[..., Any], share: float, text: str, *shared: Any
@@ -148,13 +149,6 @@ class TrainingRays:
             if i % SYNC_EVERY == 0:
                 jax.block_until_ready(sums)
         return jax.tree.map(_total, sums)
-
-
-def fit_devices(num_rays: int) -> list[jax.Device]:
-    """As many of the local devices as divide a call's rays, each of which has sums of its own to keep."""
-    devices = jax.local_devices()
-    count = max(n for n in range(1, min(FIT_DEVICES, len(devices)) + 1) if num_rays % n == 0)
-    return devices[:count]
 
 
 def _total(sums: jax.Array) -> np.ndarray:

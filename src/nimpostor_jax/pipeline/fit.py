@@ -28,7 +28,7 @@ from nimpostor_jax.io.checkpoint import (
 from nimpostor_jax.pipeline.prepare import Log, Scene
 from nimpostor_jax.render.capacity import grow_march
 from nimpostor_jax.train.pool import draw_batch
-from nimpostor_jax.train.sharding import data_parallel, device_mesh, over_rays, replicated
+from nimpostor_jax.train.sharding import data_parallel, device_mesh, dividing_devices, over_rays, replicated
 from nimpostor_jax.train.step import (
     TrainState,
     init_state,
@@ -85,7 +85,7 @@ def fit(
     `TrainConfig.eval_every` steps. Raises FloatingPointError where the loss is not finite.
     """
     config = scene.config.train
-    devices = _usable_devices(config)
+    devices = dividing_devices(config.rays_per_batch)
     optimizer = make_optimizer()
     state = init_state(scene.impostor, optimizer, config.cells_per_edge, config.occupancy)
     progress = Progress()
@@ -171,11 +171,6 @@ def fit(
 
 _SYNC_EVERY = 8  # steps that may be under way at once
 _OCCUPANCY_EVERY = 16  # steps, as in Instant-NGP
-
-
-def _usable_devices(config: TrainConfig) -> Sequence[jax.Device]:
-    devices = jax.local_devices()
-    return devices if config.rays_per_batch % len(devices) == 0 else devices[:1]
 
 
 def _trained(scene: Scene, state: TrainState, devices: Sequence[jax.Device]) -> NeuralImpostor:

@@ -21,6 +21,15 @@ def device_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
     return jax.make_mesh((len(devices),), (AXIS,), axis_types=(AxisType.Auto,), devices=devices)
 
 
+def dividing_devices(
+    num_rays: int, *, at_most: int | None = None, devices: Sequence[jax.Device] | None = None
+) -> Sequence[jax.Device]:
+    """The first of the local (or the given) devices: as many as can share a batch of rays evenly."""
+    devices = devices or jax.local_devices()
+    most = min(len(devices), at_most or len(devices))
+    return devices[: max(n for n in range(1, most + 1) if num_rays % n == 0)]
+
+
 def data_parallel(mesh: Mesh) -> Callable[..., tuple[Parameters, Metrics]]:
     """`loss_gradient` with the batch's rays split over the mesh; gradients and metrics are averaged.
 
