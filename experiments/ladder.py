@@ -14,11 +14,11 @@ from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.gin_flags import load_config, operative_config_text
 from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.blender import PosedImages
-from nimpostor_jax.io.images import composite, read_image, write_png
+from nimpostor_jax.io.images import read_image, write_png
 from nimpostor_jax.io.impostor_file import load_baked, load_impostor, save_impostor
-from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.bake import bake
-from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, evaluate, write_json
+from nimpostor_jax.pipeline.curve import HeldOutCurve
+from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
 from nimpostor_jax.pipeline.fit import fit
 from nimpostor_jax.pipeline.prepare import Scene, prepare
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
@@ -33,7 +33,6 @@ METHODS = {
     "FeatInt": "feat_int",
 }
 CURVE_POINTS = 10  # of held-out PSNR against training time
-CURVE_VIEWS = 4
 # What --quick puts in the place of the defaults: every step of the script in a minute or two, for tests.
 QUICK = (
     "CageConfig.target_tets=100",
@@ -82,23 +81,11 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
     if row_file.exists() and settings.read_text(encoding="utf-8") == text:
         print(f"{workdir}: trained already")
         return Trained(scene, load_impostor(file), json.loads(row_file.read_text(encoding="utf-8")))
-    views = scene.test.select(np.linspace(0, len(scene.test) - 1, CURVE_VIEWS).astype(int))
-    curve_file = workdir / "curve.json"  # of a run that was cut off, too
-    curve = json.loads(curve_file.read_text(encoding="utf-8")) if curve_file.exists() else []
-
-    def measure(impostor: NeuralImpostor, step: int) -> None:
-        sized = frame_config(impostor, camera_of(views, 0), config.render)
-        frames = [render_frame(impostor, camera_of(views, i), sized) for i in range(len(views))]
-        behind = [views.background(i, "white") for i in range(len(views))]
-        images = [composite_frame(*pair) for pair in zip(frames, behind, strict=True)]
-        truths = [composite(*pair) for pair in zip(views.images, behind, strict=True)]
-        curve[:] = [point for point in curve if point[0] < step]
-        curve.append((step, float(np.mean([psnr(*pair) for pair in zip(images, truths, strict=True)]))))
-        write_json(curve_file, curve)
-
-    impostor, progress = fit(scene, workdir=workdir, callback=measure)
+    curve = HeldOutCurve(scene, workdir / "curve.json")
+    impostor, progress = fit(scene, workdir=workdir, callback=curve)
     save_impostor(file, impostor)
-    result = evaluate(impostor, scene.test, config.render, pictures=workdir / "pictures")
+    behind, pictures = config.data.background, workdir / "pictures"
+    result = evaluate(impostor, scene.test, config.render, background=behind, pictures=pictures)
     with open(workdir / "log.csv", newline="", encoding="utf-8") as log:
         seconds = {int(line["step"]): float(line["seconds"]) for line in csv.DictReader(log)}
     row = {
@@ -114,7 +101,7 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
         "parameters": int(scene.impostor.tables.features.size),
         "steps": progress.step,
         "rays_per_batch": config.train.rays_per_batch,
-        "curve": [(seconds[step], value) for step, value in curve],
+        "curve": [(seconds[step], value) for step, value in curve.points],
     }
     with atomic_path(settings) as path:
         path.write_text(text, encoding="utf-8")
@@ -135,7 +122,8 @@ def bake_or_reuse(trained: Trained, workdir: Path) -> tuple[BakedImpostor, Row]:
     baked = bake(trained.impostor, trained.scene, config.bake)
     seconds = time.perf_counter() - start
     save_impostor(file, baked)
-    result = evaluate(baked, trained.scene.test, config.render, pictures=workdir / "pictures")
+    behind, pictures = config.data.background, workdir / "pictures"
+    result = evaluate(baked, trained.scene.test, config.render, background=behind, pictures=pictures)
     camera = camera_of(trained.scene.test, 0)
     sized = frame_config(baked, camera, config.render)
     rasterize_frame(baked, camera, sized)  # compiles

@@ -3,7 +3,8 @@
     python experiments/train.py --gin_configs=experiments/configs/mic.gin --data=DIR --workdir=out/mic
 
 Writes cage.npz, config.gin, checkpoints/, log.csv, impostor.npz, metrics.json and pictures/*.png to the
-workdir. A run that was cut off continues from its last checkpoint when it is started again.
+workdir, and held-out PSNR every TrainConfig.eval_every steps to curve.json. A run that was cut off
+continues from its last checkpoint when it is started again.
 """
 
 import argparse
@@ -14,6 +15,7 @@ from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.gin_flags import add_flags, config_from_args, operative_config_text, run_cli
 from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.impostor_file import save_impostor
+from nimpostor_jax.pipeline.curve import HeldOutCurve
 from nimpostor_jax.pipeline.evaluate import evaluate, write_json
 from nimpostor_jax.pipeline.fit import fit
 from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
@@ -49,7 +51,8 @@ def train(
     scene = prepare(config, data, cage=cage, cage_output=own_cage)
     with atomic_path(workdir / "config.gin") as path:
         path.write_text(operative_config_text(config), encoding="utf-8")
-    impostor, progress = fit(scene, workdir=workdir, max_minutes=max_minutes)
+    curve = HeldOutCurve(scene, workdir / "curve.json") if config.train.eval_every else None
+    impostor, progress = fit(scene, workdir=workdir, max_minutes=max_minutes, callback=curve)
     print(f"trained {progress.step} steps in {progress.seconds / 60:.1f} minutes")
     save_impostor(workdir / "impostor.npz", impostor)
     result = evaluate(

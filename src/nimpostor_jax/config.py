@@ -291,7 +291,7 @@ class TrainConfig:
     forget_rays: int = 2_000_000  # rays after which a cell that none has seen counts as empty
     seed: int = 0
     log_every: int = 50
-    eval_every: int = 0  # 0: only at the end
+    eval_every: int = 0  # steps between measurements of held-out PSNR; 0: only at the end
     checkpoint_every: int = 500
 
     def __post_init__(self) -> None:

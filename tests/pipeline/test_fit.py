@@ -2,16 +2,22 @@
 
 import csv
 import dataclasses
+import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from nimpostor_jax.gin_flags import load_config
+from nimpostor_jax.io.images import composite
 from nimpostor_jax.io.mesh_files import save_tets
+from nimpostor_jax.metrics import psnr
+from nimpostor_jax.pipeline.curve import HeldOutCurve
 from nimpostor_jax.pipeline.evaluate import evaluate, orbit, vertical
 from nimpostor_jax.pipeline.fit import Progress, fit
 from nimpostor_jax.pipeline.prepare import prepare
+from nimpostor_jax.render.frame import _render_sharded
 
 
 class Killed(Exception):
@@ -54,6 +60,28 @@ def test_loss_falls_and_time_budget_ends_the_run(scene):
     after = evaluate(trained, scene.test.select([0]), scene.config.render, log=lambda _: None)
     assert progress.seconds >= 3
     assert after["psnr"] > before["psnr"] + 1  # an untrained fog against seconds of training
+
+
+def test_a_curve_is_that_of_evaluation_and_compiles_once(scene, tmp_path):
+    """Cells that become empty change no buffer; a run that goes on drops the points beyond its checkpoint."""
+    file, lines = tmp_path / "curve.json", []
+    file.write_text("[[1, 10.0], [2, 11.0], [6, 30.0]]")
+    curve = HeldOutCurve(scene, file, log=lines.append)
+    full = dataclasses.replace(scene.impostor, occupied=jnp.ones((6, 20), bool))
+    curve(full, 2)
+    programs = _render_sharded._cache_size()
+    curve(dataclasses.replace(full, occupied=jnp.zeros((6, 20), bool)), 4)
+    assert _render_sharded._cache_size() == programs
+    assert json.loads(file.read_text()) == [list(point) for point in curve.points]
+    steps, (_, untrained, nothing) = zip(*curve.points, strict=True)
+    assert steps == (1, 2, 4)
+    views = scene.test.select(np.linspace(0, len(scene.test) - 1, 4).astype(int))
+    result = evaluate(full, views, scene.config.render, log=lambda _: None)
+    assert untrained == pytest.approx(result["psnr"], abs=1e-6)
+    truths = [composite(image, "white") for image in views.images]
+    white = np.mean([psnr(np.ones_like(truth), truth) for truth in truths])
+    assert nothing == pytest.approx(white, abs=1e-6)
+    assert lines[0] == f"step 2: PSNR {untrained:.2f} dB on 4 held-out views"
 
 
 def test_evaluation_writes_pictures(scene, tmp_path):
