@@ -63,25 +63,27 @@ def test_loss_falls_and_time_budget_ends_the_run(scene):
 
 
 def test_a_curve_is_that_of_evaluation_and_compiles_once(scene, tmp_path):
-    """Cells that become empty change no buffer; a run that goes on drops the points beyond its checkpoint."""
+    """Cells that become empty change no buffer; points beyond the checkpoint, or of other settings, go."""
+    train = dataclasses.replace(scene.config.train, eval_every=2)
+    scene = dataclasses.replace(scene, config=dataclasses.replace(scene.config, train=train))
     file, lines = tmp_path / "curve.json", []
-    file.write_text("[[1, 10.0], [2, 11.0], [6, 30.0]]")
+    file.write_text("[[2, 10.0], [3, 10.5], [4, 11.0], [6, 30.0]]")
     curve = HeldOutCurve(scene, file, log=lines.append)
     full = dataclasses.replace(scene.impostor, occupied=jnp.ones((6, 20), bool))
-    curve(full, 2)
+    curve(full, 4)
     programs = _render_sharded._cache_size()
-    curve(dataclasses.replace(full, occupied=jnp.zeros((6, 20), bool)), 4)
+    curve(dataclasses.replace(full, occupied=jnp.zeros((6, 20), bool)), 6)
     assert _render_sharded._cache_size() == programs
     assert json.loads(file.read_text()) == [list(point) for point in curve.points]
     steps, (_, untrained, nothing) = zip(*curve.points, strict=True)
-    assert steps == (1, 2, 4)
+    assert steps == (2, 4, 6)
     views = scene.test.select(np.linspace(0, len(scene.test) - 1, 4).astype(int))
     result = evaluate(full, views, scene.config.render, log=lambda _: None)
     assert untrained == pytest.approx(result["psnr"], abs=1e-6)
     truths = [composite(image, "white") for image in views.images]
     white = np.mean([psnr(np.ones_like(truth), truth) for truth in truths])
     assert nothing == pytest.approx(white, abs=1e-6)
-    assert lines[0] == f"step 2: PSNR {untrained:.2f} dB on 4 held-out views"
+    assert lines[0] == f"step 4: PSNR {untrained:.2f} dB on 4 held-out views"
 
 
 def test_evaluation_writes_pictures(scene, tmp_path):

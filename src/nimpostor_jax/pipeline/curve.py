@@ -19,8 +19,8 @@ MAX_VIEWS = 4
 class HeldOutCurve:
     """A callback of `fit`: the mean PSNR on at most `MAX_VIEWS` of a scene's held-out views.
 
-    `points` are (step, decibels), in `file` as JSON too. Those that a run which was cut off left there are
-    kept up to the step at which it goes on.
+    `points` are (step, decibels) at multiples of `TrainConfig.eval_every`, in `file` as JSON too. Those that
+    a run which was cut off left there are kept up to the step at which it goes on.
     """
 
     def __init__(self, scene: Scene, file: Path, *, log: Log = print):
@@ -29,12 +29,15 @@ class HeldOutCurve:
         self._scene, self._file, self._log = scene, file, log
         self._config: RenderConfig | None = None
         saved = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
-        self.points: list[tuple[int, float]] = [(step, value) for step, value in saved]
+        every = max(1, scene.config.train.eval_every)  # other steps are those of a run with other settings
+        self.points: list[tuple[int, float]] = [(step, value) for step, value in saved if step % every == 0]
 
     def __call__(self, impostor: NeuralImpostor, step: int) -> None:
         """Measure and note a point."""
         views, config = self._views, self._scene.config
-        if self._config is None:  # cells only become fewer: buffers of the first time do, and compile once
+        # Buffers of the first time, so that nothing compiles again: cells become fewer, and what overflows is
+        # rendered again.
+        if self._config is None:
             self._config = frame_config(impostor, camera_of(views, 0), config.render)
         values = []
         for i in range(len(views)):
