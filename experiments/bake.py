@@ -18,7 +18,7 @@ from nimpostor_jax.io.impostor_file import load_impostor, save_impostor
 from nimpostor_jax.pipeline.bake import bake
 from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
 from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
-from nimpostor_jax.render.frame import Frame, frame_config, render_frame
+from nimpostor_jax.render.frame import Frame, for_frames, frame_config, render_frame
 from nimpostor_jax.render.raster_frame import rasterize_frame
 
 REPEATS = 5
@@ -45,11 +45,12 @@ def main(argv: Sequence[str]) -> None:
     result = evaluate(baked, scene.test, config.render, background=background, pictures=pictures)
 
     camera = camera_of(scene.test, 0)
+    ready, textured = for_frames(impostor), for_frames(baked)
     ways: dict[str, Callable[[], Frame]] = {}
     for name, each, render in (
-        ("field", impostor, render_frame),
-        ("baked, marched", baked, render_frame),
-        ("baked, rasterized", baked, rasterize_frame),
+        ("field", ready, render_frame),
+        ("baked, marched", textured, render_frame),
+        ("baked, rasterized", textured, rasterize_frame),
     ):
         sized = frame_config(each, camera, config.render)
         ways[name] = lambda e=each, r=render, s=sized: r(e, camera, s)  # type: ignore[misc]

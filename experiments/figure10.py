@@ -11,7 +11,6 @@ Writes figure10.json (`rows`), .csv, .md and a picture of every proxy's render.
 import argparse
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -37,6 +36,7 @@ from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.cage import cage_from_images
 from nimpostor_jax.preprocess.tetrahedralize import box_tets, run_ftetwild
 from nimpostor_jax.preprocess.visual_hull import visual_hull
+from nimpostor_jax.train.sharding import num_cores
 
 # Tets of each proxy; the paper's PSNR lies between 32.58 and 33.24 dB for all seven.
 PROXIES = {
@@ -78,7 +78,7 @@ def main(argv: Sequence[str]) -> None:
         spread = max(row["psnr"] for row in rows) - min(row["psnr"] for row in rows)
         notes = (
             f"{resolution} pixels wide, {config.train.steps} steps of {config.train.rays_per_batch} rays, "
-            f"{len(os.sched_getaffinity(0))} cores; PSNR within {spread:.2f} dB (the paper: 0.66)."
+            f"{num_cores()} cores; PSNR within {spread:.2f} dB (the paper: 0.66)."
         )
         write_table(args.out / "figure10", rows, COLUMNS, notes)
     write_picture(args.out / "figure10.png", trained.scene.test, runs)

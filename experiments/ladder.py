@@ -1,6 +1,8 @@
 """The methods that the paper's tables compare, trained or reused; and the tables' files."""
 
 import csv
+import dataclasses
+import hashlib
 import json
 import time
 from collections.abc import Sequence
@@ -13,14 +15,17 @@ import numpy as np
 from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.gin_flags import load_config, operative_config_text
 from nimpostor_jax.io.atomic import atomic_path
-from nimpostor_jax.io.blender import PosedImages
+from nimpostor_jax.io.blender import PosedImages, check_masks, load_scene
 from nimpostor_jax.io.images import read_image, write_png
 from nimpostor_jax.io.impostor_file import load_baked, load_impostor, save_impostor
+from nimpostor_jax.io.mesh_files import save_tets
+from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.pipeline.bake import bake
 from nimpostor_jax.pipeline.curve import HeldOutCurve
-from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, picture_name, write_json
 from nimpostor_jax.pipeline.fit import fit
 from nimpostor_jax.pipeline.prepare import Scene, prepare
+from nimpostor_jax.preprocess.cage import cage_from_images
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
 from nimpostor_jax.render.raster_frame import rasterize_frame
 from nimpostor_jax.types import BakedImpostor, NeuralImpostor
@@ -57,6 +62,24 @@ class Trained(NamedTuple):
     row: Row
 
 
+def cage_of(data: str, given: Path | None, folder: Path, config: ExperimentConfig, quick: bool) -> Path:
+    """Where the cage of all of a scene's methods is: the given file, or one in `folder`, built if need be.
+
+    An envelope, of which NGP-Bounded takes the bounding box; that of a quick run is apart. Raises
+    FileNotFoundError for a given file that is not there.
+    """
+    if given is not None:
+        if not given.is_file():
+            raise FileNotFoundError(f"cage {given} does not exist; without --cage one is built")
+        return given
+    path = (folder / f"{QUICK_RESOLUTION}" if quick else folder) / "cage.npz"
+    if not path.exists():
+        train, _ = load_scene(resolve_scene(data), config.data)
+        check_masks(train)
+        save_tets(path, *cage_from_images(train, dataclasses.replace(config.cage, shape="envelope")))
+    return path
+
+
 def config_of(
     method: str, resolution: int, configs: Sequence[Path], bindings: Sequence[str]
 ) -> ExperimentConfig:
@@ -69,16 +92,19 @@ def config_of(
 
 
 def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path, workdir: Path) -> Trained:
-    """Train a method on a scene, or take what an earlier run with the same config left in `workdir`.
+    """Train a method on a scene, or take what an earlier run left in `workdir`, finished or not.
 
-    `cage` is where all methods' cage is, or is put.
+    Raises ValueError where that had other settings, pictures or another cage.
     """
-    scene = prepare(config, data, cage=cage if cage.exists() else None, cage_output=cage)
-    settings, row_file, file = (workdir / name for name in ("config.gin", "row.json", "impostor.npz"))
+    scene = prepare(config, data, cage=cage)
+    row_file, file = (workdir / name for name in ("row.json", "impostor.npz"))
     # Training knows nothing of these, and what uses the run may have other defaults by then.
     lines = operative_config_text(config).splitlines(keepends=True)
     text = "".join(line for line in lines if not line.startswith(("BakeConfig.", "RetrainConfig.")))
-    if row_file.exists() and settings.read_text(encoding="utf-8") == text:
+    mesh, views = scene.impostor.mesh, scene.train
+    cameras = views.camera_to_world, views.focal, views.principal
+    _claim(workdir, text, mesh.vertices, mesh.tets, mesh.center, mesh.scale, views.images, *cameras)
+    if row_file.exists():
         print(f"{workdir}: trained already")
         return Trained(scene, load_impostor(file), json.loads(row_file.read_text(encoding="utf-8")))
     curve = HeldOutCurve(scene, workdir / "curve.json")
@@ -103,19 +129,36 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
         "rays_per_batch": config.train.rays_per_batch,
         "curve": [(seconds[step], value) for step, value in curve.points],
     }
-    with atomic_path(settings) as path:
-        path.write_text(text, encoding="utf-8")
     write_json(row_file, row)
     forget_programs()
     return Trained(scene, impostor, row)
 
 
+def _claim(workdir: Path, settings: str, *arrays: Any) -> None:
+    """Write down what a folder's run is made from, or raise ValueError where it has been made from other."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array).reshape(-1))
+    text, path = f"# made from {digest.hexdigest()[:16]}\n{settings}", workdir / "config.gin"
+    if not path.exists():
+        with atomic_path(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        return
+    there = path.read_text(encoding="utf-8").splitlines()
+    changed = [line for line in text.splitlines() if line not in there]
+    if changed:
+        what = "its cage, pictures or field" if changed[-1].startswith("#") else f"not {changed[-1]}"
+        raise ValueError(
+            f"{workdir} has a run of other input ({what}); remove that folder, or use another --out"
+        )
+
+
 def bake_or_reuse(trained: Trained, workdir: Path) -> tuple[BakedImpostor, Row]:
     """Bake a method's impostor, or take what an earlier run left in `workdir`; and the row of the table."""
     config = trained.scene.config
-    settings, row_file, file = (workdir / name for name in ("config.gin", "row.json", "baked.npz"))
-    text = operative_config_text(config)
-    if row_file.exists() and settings.read_text(encoding="utf-8") == text:
+    row_file, file = (workdir / name for name in ("row.json", "baked.npz"))
+    _claim(workdir, operative_config_text(config), trained.impostor.tables.features)  # type: ignore[union-attr]
+    if row_file.exists():
         print(f"{workdir}: baked already")
         return load_baked(file), json.loads(row_file.read_text(encoding="utf-8"))
     start = time.perf_counter()
@@ -145,8 +188,6 @@ def bake_or_reuse(trained: Trained, workdir: Path) -> tuple[BakedImpostor, Row]:
         ),
         "tets": len(baked.mesh.tets),
     }
-    with atomic_path(settings) as path:
-        path.write_text(text, encoding="utf-8")
     write_json(row_file, row)
     forget_programs()
     return baked, row
@@ -173,7 +214,7 @@ def seconds_to(curve: Sequence[tuple[float, float]], target: float) -> float | N
 
 def write_picture(path: Path, views: PosedImages, folders: Sequence[Path]) -> None:
     """The first held-out view, from the pictures in the runs' folders: truth, then every method."""
-    name = f"{Path(views.names[0]).stem}.png"
+    name = picture_name(views, 0)
     panels = [read_image(folder / "pictures" / name)[0][..., :3] for folder in folders]
     truth = panels[0][:, : views.width]
     renders = [panel[:, views.width : 2 * views.width] for panel in panels]

@@ -9,7 +9,6 @@ ours is faster.
 
 import contextlib
 import dataclasses
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -25,11 +24,11 @@ from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.preprocess.validate import orient_tets
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, tile_order
-from nimpostor_jax.train.sharding import AXIS, device_mesh, over_rays, replicated
+from nimpostor_jax.train.sharding import AXIS, device_mesh, num_cores, over_rays, replicated
 from nimpostor_jax.types import Camera, NeuralImpostor, Rays, TetMesh
 
 Row = dict[str, Any]
-CORES = len(os.sched_getaffinity(0))
+CORES = num_cores()
 SPLIT = P(AXIS)
 
 

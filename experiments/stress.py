@@ -19,7 +19,6 @@ inverted tets.
 import argparse
 import itertools
 import multiprocessing
-import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import partial
@@ -51,6 +50,7 @@ from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.composite import sample_weights, sum_by_ray
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import Crossings, march_tables, traverse
+from nimpostor_jax.train.sharding import num_cores
 from nimpostor_jax.types import Rays, TetMesh, TetSegments
 
 Row = dict[str, float]
@@ -74,7 +74,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--cage", type=Path, action="append", default=[], help=".npz with V and T")
     parser.add_argument("--only", nargs="*", help="these meshes")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=len(os.sched_getaffinity(0)), help="processes")
+    parser.add_argument("--workers", type=int, default=num_cores(), help="processes")
     args = parser.parse_args(argv)
     cases = {name: make(np.random.default_rng(args.seed)) for name, make in MESHES.items()}
     cases = {name: case for name, case in cases.items() if args.only is None or name in args.only}

@@ -4,13 +4,14 @@
     python experiments/table2.py --scene fluffy_ball --out=out/table2 --quick
 
 Every method is trained with the same cage, steps and batch, one after another; what an earlier run trained
-with the same settings is reused. Writes table2.json (`rows`), .csv, .md, and a picture of every method.
+is reused, or refused where its settings, pictures or cage were others. Without `--cage` one is built in
+the scene's folder in `--out`, or taken from there. Writes table2.json (`rows`), .csv, .md, and a picture of
+every method.
 `speedup` compares the training times, without compiling, of NGP-Bounded and the method to the same PSNR on
 some held-out views: the lower of the two that they end with.
 """
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +22,7 @@ from ladder import (
     Row,
     Trained,
     bake_or_reuse,
+    cage_of,
     config_of,
     seconds_to,
     train_or_reuse,
@@ -30,6 +32,7 @@ from ladder import (
 
 from nimpostor_jax.gin_flags import add_flags, run_cli
 from nimpostor_jax.pipeline.prepare import use_all_cores
+from nimpostor_jax.train.sharding import num_cores
 
 # PSNR and SSIM, averages over the paper's scenes; training minutes on its GPU.
 PAPER = {
@@ -70,22 +73,29 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(f"{len(args.cage)} cages for {len(args.scene)} scenes; give one each, or none")
     use_all_cores()
     bindings = [*(QUICK if args.quick else ()), *args.gin_bindings]
+    folders = [args.out / Path(scene).name for scene in args.scene]
+    if len(set(folders)) < len(folders):
+        raise ValueError(f"scenes need folders of different names, got {args.scene}")
+    resolutions = [QUICK_RESOLUTION] if args.quick else args.resolution
+    config = config_of(args.methods[0], resolutions[0], args.gin_configs, bindings)
+    given = args.cage or [None] * len(folders)
+    cages = [cage_of(*each, config, args.quick) for each in zip(args.scene, given, folders, strict=True)]
     rows: list[Row] = []
-    for i, scene in enumerate(args.scene):
-        for resolution in [QUICK_RESOLUTION] if args.quick else args.resolution:
-            folder = args.out / Path(scene).name
-            cage = args.cage[i] if args.cage else folder / "cage.npz"
+    for scene, folder, cage in zip(args.scene, folders, cages, strict=True):
+        for resolution in resolutions:
+            place = folder / f"{resolution}"
             trained = []
             for method in args.methods:
                 config = config_of(method, resolution, args.gin_configs, bindings)
-                workdir = folder / f"{resolution}" / method
-                trained.append(train_or_reuse(method, config, scene, cage, workdir))
+                trained.append(train_or_reuse(method, config, scene, cage, place / method))
+            known = rows + compared(trained)  # a baking may be refused
+            write_table(args.out / "table2", known, COLUMNS, notes(known))
             if "FeatInt" in args.methods and not args.no_bake:
                 source = trained[args.methods.index("FeatInt")]
-                baked, row = bake_or_reuse(source, folder / f"{resolution}" / "Baked")
+                baked, row = bake_or_reuse(source, place / "Baked")
                 trained.append(source._replace(impostor=baked, row=row))
             rows += compared(trained)
-            runs = [folder / f"{resolution}" / each.row["method"] for each in trained]
+            runs = [place / each.row["method"] for each in trained]
             write_picture(folder / f"{resolution}.png", trained[0].scene.test, runs)
             write_table(args.out / "table2", rows, COLUMNS, notes(rows))
 
@@ -112,7 +122,7 @@ def notes(rows: Sequence[Row]) -> str:
     """What the figures hold for."""
     steps, rays = ({row[key] for row in rows} for key in ("steps", "rays_per_batch"))
     return (
-        f"{sorted(steps)} steps of {sorted(rays)} rays on {len(os.sched_getaffinity(0))} cores; "
+        f"{sorted(steps)} steps of {sorted(rays)} rays on {num_cores()} cores; "
         "fps: whole frames of held-out views. The paper's figures are averages over its scenes, 800x800."
     )
 

@@ -145,6 +145,9 @@ def test_edit_deform_compares_with_true_pictures(tmp_path):
         ),
         ("bake.py", ["--data=fluffy_ball", "--workdir=W"], "config.gin"),
         ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage", "a.npz", "b.npz"], "2 cages for 1 scenes"),
+        ("table2.py", ["--scene=fluffy_ball", "--out=W", "--cage=none.npz"], "none.npz does not exist"),
+        ("table1.py", ["--scene=fluffy_ball", "--out=W", "--cage=none.npz"], "none.npz does not exist"),
+        ("table2.py", ["--scene", "a/mic", "b/mic", "--out=W"], "different names"),
         ("make_cage.py", ["--surface=none.obj", "--out=W/c.npz"], "none.obj"),
         ("capture.py", ["--data=nowhere", "--workdir=W"], "nowhere"),
         ("capture.py", ["--data=nowhere", "--workdir=W", "--coarse_bindings=TrainConfig.stepz=1"], "steps"),
@@ -174,24 +177,26 @@ def test_help_says_what_there_is(script):
     assert "--gin_bindings" in done.stdout and "TrainConfig.steps" in done.stdout
 
 
-SHELL = ROOT.parent / "shared" / "data" / "cages" / "fluffy_ball_shell600.npz"
-
-
 @pytest.mark.slow
 def test_the_tables_come_out_of_scripts(tmp_path):
     """Every method trained, baked, bent, timed, in small; the second script takes the first one's runs."""
-    cage = [f"--cage={SHELL}"] if SHELL.exists() else []
-    done = run("table2.py", "--scene=fluffy_ball", f"--out={tmp_path}", "--quick", *cage, timeout=1500)
+    done = run("table2.py", "--scene=fluffy_ball", f"--out={tmp_path}", "--quick", timeout=1500)
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "table2.json").read_text())["rows"]
     assert [row["method"] for row in rows] == ["NGP-Bounded", "BaryEnc", "BarySpl", "FeatInt", "Baked"]
     for row in rows:
         assert row["psnr"] > 5 and row["fps"] > 0 and row["steps"] == 20 and row["resolution"] == 24
     assert rows[-1]["raster_difference"] < 1e-3
+    tets = [row["tets"] for row in rows]
+    assert tets[0] == 6 and len(set(tets[1:4])) == 1 and 50 < tets[1] < 200  # about 100 are asked for
     for name in ("table2.csv", "table2.md", "fluffy_ball/24.png"):
         assert (tmp_path / name).exists()
 
-    done = run("table1.py", "--scene=fluffy_ball", f"--out={tmp_path}", "--quick", *cage, timeout=900)
+    other = ["--quick", "--gin_bindings=TrainConfig.seed=1"]
+    refused = run("table2.py", "--scene=fluffy_ball", f"--out={tmp_path}", *other)
+    assert refused.returncode == 2 and "run of other input (not TrainConfig.seed = 1)" in refused.stderr
+
+    done = run("table1.py", "--scene=fluffy_ball", f"--out={tmp_path}", "--quick", timeout=900)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("trained already") == 3 and "baked already" in done.stdout
     rows = json.loads((tmp_path / "table1.json").read_text())["rows"]

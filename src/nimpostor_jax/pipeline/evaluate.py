@@ -17,7 +17,7 @@ from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.blender import PosedImages
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.lpips import MIN_SIDE as LPIPS_MIN_SIDE
-from nimpostor_jax.render.frame import Frame, frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import Frame, frame_config, on_all_devices, render_frame, to_image
 from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor
 
 Log = Callable[[str], None]
@@ -46,6 +46,7 @@ def evaluate(
     per_view: list[dict[str, Any]] = []
     seconds = []
     sized = frame_config(impostor, camera_of(views, 0), config)
+    impostor = on_all_devices(impostor)
     render_frame(impostor, camera_of(views, 0), sized)  # compiles
     for index, name in enumerate(views.names):
         start = time.perf_counter()
@@ -69,7 +70,7 @@ def evaluate(
                 np.clip(4 * np.abs(truth - image), 0, 1),
                 depth_picture(frame.depth, frame.opacity),
             ]
-            write_png(Path(pictures) / f"{Path(name).stem}.png", np.concatenate(panel, axis=1))
+            write_png(Path(pictures) / picture_name(views, index), np.concatenate(panel, axis=1))
     result: dict[str, Any] = {
         key: _mean([view[key] for view in per_view]) for key in ("psnr", "ssim", "lpips")
     }
@@ -80,6 +81,14 @@ def evaluate(
         f"{result['seconds_per_frame']:.2f} s a frame"
     )
     return result
+
+
+def picture_name(views: PosedImages, index: int) -> str:
+    """Of a view's picture: its file's name, with its folders' where names alone are not unique."""
+    stems = [Path(name).with_suffix("") for name in views.names]
+    alone = len({stem.name for stem in stems}) == len(stems)
+    stem = stems[index]
+    return f"{stem.name if alone else '_'.join(stem.parts)}.png"
 
 
 def composite_frame(

@@ -29,6 +29,7 @@ from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.sampling import with_step
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
+from nimpostor_jax.train.sharding import num_cores
 from nimpostor_jax.types import NeuralImpostor
 
 Log = Callable[[str], None]
@@ -48,7 +49,7 @@ def use_all_cores() -> None:
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_force_host_platform_device_count" not in flags:
-        jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+        jax.config.update("jax_num_cpu_devices", num_cores())
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {SMALL_LOOPS}".strip()
     _keep_freed_memory()
@@ -61,7 +62,7 @@ def _keep_freed_memory() -> None:
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
-    except (AttributeError, OSError):  # another C library
+    except (AttributeError, OSError, TypeError):  # another C library, or Windows
         return
     mallopt(ctypes.c_int(-8), ctypes.c_int(1))  # M_ARENA_MAX
     mallopt(ctypes.c_int(-4), ctypes.c_int(0))  # M_MMAP_MAX

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from functools import cache, partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -26,6 +26,10 @@ from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor, Rays, Ren
 CHUNK = 8192  # rays a call
 MAX_REFINEMENT = 32  # of the steps, to meet a tolerance
 REPAIR_CHUNK = 1024  # rays a call with buffers of the largest size
+
+
+Rendered = TypeVar("Rendered", NeuralImpostor, BakedImpostor)
+Tree = TypeVar("Tree")
 
 
 class Frame(NamedTuple):
@@ -51,15 +55,22 @@ def _tiled_pixels(height: int, width: int) -> jax.Array:
     return image_pixels(height, width).reshape(-1, 2)[tile_order(height, width)]
 
 
-def for_frames(impostor: NeuralImpostor, max_megabytes: float = 512) -> NeuralImpostor:
+def for_frames(impostor: Rendered, max_megabytes: float = 512) -> Rendered:
     """The same impostor as many frames want it: levels merged (`field.merge_levels`), on all local devices.
 
     For rendering only, whether levels could be merged or not; it can be deformed. Merging takes about as long
     as half a frame of 800 x 800, so it pays for animations and large images. The memory is that of all
-    devices together, each of which has a copy; a CPU with `use_all_cores` has a device a core.
+    devices together, each of which has a copy; a CPU with `use_all_cores` has a device a core. A baked
+    impostor, which has no levels, is only copied.
     """
-    mesh = device_mesh()
-    return jax.device_put(merge_levels(impostor, max_megabytes / mesh.size), NamedSharding(mesh, P()))
+    if isinstance(impostor, BakedImpostor):
+        return on_all_devices(impostor)
+    return on_all_devices(merge_levels(impostor, max_megabytes / device_mesh().size))
+
+
+def on_all_devices(arrays: Tree) -> Tree:
+    """A pytree copied to all local devices now, and not again for each frame."""
+    return jax.device_put(arrays, NamedSharding(device_mesh(), P()))
 
 
 def frame_config(

@@ -1,5 +1,6 @@
 """Data parallelism around the pure step: rays are split over devices, everything else is replicated."""
 
+import os
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -13,6 +14,11 @@ from nimpostor_jax.train.step import Metrics, Parameters, RayBatch, loss_gradien
 from nimpostor_jax.types import NeuralImpostor
 
 AXIS = "rays"
+
+
+def num_cores() -> int:
+    """Cores that this process may use; where the system does not say which, all."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def device_mesh(devices: Sequence[jax.Device] | None = None) -> Mesh:
