@@ -18,6 +18,7 @@ from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
 from nimpostor_jax.io.mesh_files import save_tets
 from nimpostor_jax.pipeline.capture import box_region, captured_cage, make_scene
 from nimpostor_jax.pipeline.prepare import use_all_cores
+from nimpostor_jax.render.sampling import with_step
 
 CONFIGS = Path(__file__).parent / "configs"
 
@@ -52,6 +53,8 @@ def main(argv: Sequence[str]) -> None:
     region = None if args.box is None else box_region(args.box)
     config = load_config([CONFIGS / "capture.gin", *args.gin_configs], args.gin_bindings)
     coarse = load_config([CONFIGS / "capture_coarse.gin"], args.coarse_bindings)
+    for each in (config, coarse):
+        with_step(each.render, each.impostor.encoding)  # asks for a step where there must be one
 
     use_all_cores()
     folder, region = make_scene(args.data, args.workdir, config, region)

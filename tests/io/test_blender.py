@@ -1,3 +1,4 @@
+import copy
 import math
 from pathlib import Path
 
@@ -76,6 +77,31 @@ def test_file_path_with_a_suffix(make_scene, rgba):
     meta["frames"][0]["file_path"] = "train/r_0.png"
     write_transforms(folder, "train", meta)
     assert load_blender(folder, "train").names == ("train/r_0.png",)
+
+
+def test_pictures_may_lie_elsewhere(make_scene, rgba, tmp_path):
+    folder = make_scene([rgba(4, 4)])
+    frames = read_transforms(folder, "train")
+    (folder / "train" / "r_0.png").rename(tmp_path / "far.png")
+    frames["frames"][0]["file_path"] = str(tmp_path / "far.png")
+    write_transforms(folder, "train", frames)
+    assert load_blender(folder, "train").names == ("../far.png",)
+
+
+def test_cameras_far_from_the_origin(make_scene, rgba):
+    """What float32 cannot tell apart is refused; some thousands of distances are fine."""
+    folder = make_scene([rgba(64, 64), rgba(64, 64)])
+    meta = read_transforms(folder, "train")
+    for shift, fine in ((1e4, True), (1e7, False)):
+        moved = copy.deepcopy(meta)
+        for frame in moved["frames"]:
+            frame["transform_matrix"][0][3] += shift
+        write_transforms(folder, "train", moved)
+        if fine:
+            load_blender(folder, "train")
+        else:
+            with pytest.raises(ValueError, match=r"transforms_train.json: .*; subtract that point from all"):
+                load_blender(folder, "train")
 
 
 def test_select(make_scene, rgba):

@@ -9,11 +9,11 @@ import pytest
 from captures import dome, write_capture
 from numpy.testing import assert_allclose
 
-from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.config import DataConfig, ExperimentConfig
 from nimpostor_jax.io.blender import load_blender, load_scene
 from nimpostor_jax.io.scenes import builtin_scene
 from nimpostor_jax.pipeline import capture
-from nimpostor_jax.pipeline.capture import box_region, make_scene, object_grid
+from nimpostor_jax.pipeline.capture import box_region, captured_cage, make_scene, object_grid
 from nimpostor_jax.pipeline.prepare import prepare_views
 from nimpostor_jax.preprocess.surroundings import Region, pixel_directions
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
@@ -54,6 +54,30 @@ def test_the_dataset_folder_is_whole_and_knows_its_backgrounds(photographs, tmp_
     assert_allclose(same.bounds, region.bounds)
     with pytest.raises(ValueError, match="was made from other input"):
         make_scene(photographs, tmp_path / "work", config, box_region([-1, -1, -1, 1, 1, 1]), quiet)
+
+
+def test_what_an_earlier_capture_left_is_not_taken_for_this_ones(photographs, tmp_path):
+    (tmp_path / "cage.npz").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"no scene, but cage\.npz of an earlier one; remove"):
+        make_scene(photographs, tmp_path, ExperimentConfig(), log=quiet)
+    (tmp_path / "coarse").mkdir()
+    (tmp_path / "coarse" / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match="coarse has a fit with other --coarse_bindings; remove it"):
+        captured_cage(tmp_path, Region(-np.ones(3), np.ones(3)), *2 * [ExperimentConfig()], tmp_path, quiet)
+
+
+@pytest.mark.parametrize(
+    ("config", "box", "message"),
+    [
+        (ExperimentConfig(data=DataConfig(resolution=51)), None, r"resolution = 51, but .* 50 pixels wide"),
+        (ExperimentConfig(), [90, 90, 90, 91, 91, 91], "no camera sees the region"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_long_work(photographs, tmp_path, config, box, message):
+    region = None if box is None else box_region(box)
+    with pytest.raises(ValueError, match=message):
+        make_scene(photographs, tmp_path / "work", config, region, quiet)
+    assert not (tmp_path / "work" / "scene").exists()
 
 
 def test_nothing_is_left_half_written(photographs, tmp_path):

@@ -7,6 +7,7 @@ images have no alpha, frames may name a `background_path`: a picture of what is 
 """
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from nimpostor_jax.config import DataConfig
 from nimpostor_jax.io.images import area_downsample, image_header, read_image
 from nimpostor_jax.io.transforms import (
     DISTORTION_KEYS,
+    check_near_origin,
     image_path,
     intrinsics,
     number,
@@ -193,12 +195,14 @@ def _inspect(folder: Path, split: str) -> _Split:
         values = {**meta, **frame}
         _check_undistorted(values, f"{json_path}: frame {i}")
         lenses.append(intrinsics(values, width, height, json_path, i))
+    focal = np.array([focal for focal, _ in lenses])
+    check_near_origin(matrices, focal, json_path)
     return _Split(
         json_path=json_path,
         paths=paths,
         names=tuple(_relative(path, folder) for path in paths),
         camera_to_world=matrices,
-        focal=np.array([focal for focal, _ in lenses]),
+        focal=focal,
         principal=np.array([principal for _, principal in lenses]),
         width=width,
         height=height,
@@ -273,4 +277,4 @@ def _target_size(split: _Split, resolution: int | None) -> tuple[int, int]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    return path.relative_to(folder).as_posix()
+    return Path(os.path.relpath(path, folder)).as_posix()  # it may lie elsewhere

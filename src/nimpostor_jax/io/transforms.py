@@ -15,6 +15,7 @@ from jaxtyping import Float
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
+_MAX_ROUNDING = 0.25  # pixels by which float32 may move what a camera sees
 _RIGID_TOLERANCE = 1e-3  # on the entries of R^T R - I; JSON files carry 6 digits or more
 
 
@@ -130,3 +131,22 @@ def intrinsics(
     center_y = number(values, "cy", 0.5 * stated_height, where)
     scale_x, scale_y = width / stated_width, height / stated_height
     return (focal_x * scale_x, focal_y * scale_y), (center_x * scale_x, center_y * scale_y)
+
+
+def check_near_origin(
+    camera_to_world: Float[np.ndarray, "N 4 4"], focal: Float[np.ndarray, "N 2"], source: Path
+) -> None:
+    """Raise ValueError where cameras are so far from the origin that float32 moves what they see.
+
+    By more than a quarter of a pixel, of something as far from a camera as cameras are from their mean.
+    """
+    positions = camera_to_world[:, :3, 3]
+    mean = positions.mean(axis=0)
+    distance = np.linalg.norm(positions - mean, axis=1).max()
+    rounding = np.spacing(np.abs(positions).max().astype(np.float32)) / 2
+    moved = rounding * np.median(focal) / distance if distance > rounding else 0.0
+    if moved > _MAX_ROUNDING:
+        raise ValueError(
+            f"{source}: the cameras are within {distance:.3g} of {np.round(mean, 1).tolist()}: float32 would "
+            f"move what they see by {moved:.2g} pixels; subtract that point from all positions"
+        )

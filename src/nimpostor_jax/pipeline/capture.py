@@ -18,11 +18,12 @@ from jaxtyping import Array, Float, Int
 from scipy import ndimage
 
 from nimpostor_jax.config import ExperimentConfig, RenderConfig
+from nimpostor_jax.config_dict import to_dict
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.io.atomic import atomic_folder
-from nimpostor_jax.io.blender import PosedImages, load_blender
+from nimpostor_jax.io.blender import load_blender
 from nimpostor_jax.io.capture import common_crops, read_capture, write_backgrounds, write_views
-from nimpostor_jax.io.transforms import read_json
+from nimpostor_jax.io.transforms import check_near_origin, read_json
 from nimpostor_jax.pipeline.evaluate import write_json
 from nimpostor_jax.pipeline.fit import fit
 from nimpostor_jax.pipeline.prepare import Log, Scene, prepare_views
@@ -44,6 +45,7 @@ from nimpostor_jax.types import NeuralImpostor
 
 RECORD = "capture.json"  # in the dataset folder: where it came from
 _SURROUNDINGS_WIDTH = 256  # pixels of the pictures from which the surroundings are read
+_LOOK = 16  # pixels between the rays that look for the region
 _SEARCH_VOXELS = 64  # along the region, while the object's box is sought
 _MIN_LIGHT = 0.1  # of a ray's light that a voxel takes in at least ...
 _MIN_VIEWS = 3  # ... so many views, to be the object's
@@ -73,23 +75,31 @@ def make_scene(
         record = _read_record(folder)
         if {key: record.get(key) for key in asked} != asked:
             raise ValueError(
-                f"{folder} was made from other input ({record}); remove it or use another --workdir"
+                f"{folder} was made from other input ({record}); remove {workdir} or use another --workdir"
             )
         log(f"{folder}: made already")
         lower, upper = np.array(record["bounds"])
         return folder, Region(lower, upper, record["is_ball"])
+    later = [name for name in ("coarse", "cage.npz", "checkpoints") if (workdir / name).exists()]
+    if later:  # they would be taken for this capture's
+        raise ValueError(
+            f"{workdir} has no scene, but {', '.join(later)} of an earlier one; remove {workdir} or use "
+            "another --workdir"
+        )
     capture = read_capture(data, workdir, log)
     crops, width, height = common_crops(capture, log)
-    if region is None:
-        lenses = [crop.intrinsics(width, height) for crop in crops]
-        region = region_from_cameras(
-            capture.camera_to_world,
-            np.array([focal for focal, _ in lenses]),
-            np.array([principal for _, principal in lenses]),
-            width,
-            height,
-            [str(path) for path in capture.paths],
+    if config.data.resolution is not None and config.data.resolution > width:
+        raise ValueError(
+            f"DataConfig.resolution = {config.data.resolution}, but what all undistorted images have in "
+            f"common is {width} pixels wide; lower it"
         )
+    lenses = [crop.intrinsics(width, height) for crop in crops]
+    focal, principal = (np.array(values) for values in zip(*lenses, strict=True))
+    check_near_origin(capture.camera_to_world, focal, capture.source)
+    if region is None:
+        names = [str(path) for path in capture.paths]
+        region = region_from_cameras(capture.camera_to_world, focal, principal, width, height, names)
+    check_seen(region, capture.camera_to_world, focal, principal, width, height)
     log(f"region of interest {np.round(region.bounds, 4).tolist()}; images {width} x {height}")
     is_test = np.arange(len(capture.paths)) % config.data.test_every == 0
     with atomic_folder(folder) as partial:
@@ -100,8 +110,9 @@ def make_scene(
             train.images[..., :3], train.camera_to_world, train.focal, train.principal, region
         )
         log(f"surroundings: {surroundings.known_share:.0%} of what is behind the region was seen past it")
-        for split in ("train", "test"):
-            write_backgrounds(partial, split, _backgrounds(load_blender(partial, split), surroundings))
+        for split, chosen in (("train", ~is_test), ("test", is_test)):
+            cameras = (capture.camera_to_world[chosen], focal[chosen], principal[chosen])
+            write_backgrounds(partial, split, _backgrounds(*cameras, width, height, surroundings))
         bounds = {"bounds": region.bounds.tolist(), "is_ball": region.is_ball}
         write_json(partial / RECORD, asked | bounds)
     return folder, region
@@ -122,9 +133,36 @@ def _read_record(folder: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def _backgrounds(views: PosedImages, surroundings: Surroundings) -> Iterator[Float[np.ndarray, "H W 3"]]:
-    for pose, focal, principal in zip(views.camera_to_world, views.focal, views.principal, strict=True):
-        yield surroundings(pixel_directions(pose, focal, principal, views.width, views.height))
+def check_seen(
+    region: Region,
+    camera_to_world: Float[np.ndarray, "N 4 4"],
+    focal: Float[np.ndarray, "N 2"],
+    principal: Float[np.ndarray, "N 2"],
+    width: int,
+    height: int,
+) -> None:
+    """Raise ValueError where no camera sees the region, by one ray in a square of `_LOOK` pixels a side."""
+    small = max(1, width // _LOOK), max(1, height // _LOOK)
+    zoom = np.array(small) / [width, height]
+    for pose, lens, center in zip(camera_to_world, focal * zoom, principal * zoom, strict=True):
+        if not region.is_missed(pose[:3, 3], pixel_directions(pose, lens, center, *small)).all():
+            return
+    raise ValueError(
+        f"no camera sees the region {np.round(region.bounds, 4).tolist()}; give another --box, in the poses' "
+        "world"
+    )
+
+
+def _backgrounds(
+    camera_to_world: Float[np.ndarray, "N 4 4"],
+    focal: Float[np.ndarray, "N 2"],
+    principal: Float[np.ndarray, "N 2"],
+    width: int,
+    height: int,
+    surroundings: Surroundings,
+) -> Iterator[Float[np.ndarray, "H W 3"]]:
+    for pose, lens, center in zip(camera_to_world, focal, principal, strict=True):
+        yield surroundings(pixel_directions(pose, lens, center, width, height))
 
 
 def captured_cage(
@@ -138,8 +176,14 @@ def captured_cage(
     """A cage around what a coarse field, fitted in the region, finds there.
 
     `coarse` configures the fit (NGP-Bounded), whose checkpoints go to `workdir`/coarse; `config.cage` the
-    cage. Raises ValueError where the field finds nothing, or as in `cage_from_grid`.
+    cage. Raises ValueError where the field finds nothing, where that folder's fit has another configuration,
+    or as in `cage_from_grid`.
     """
+    settings = workdir / "coarse" / "config.json"
+    values = json.loads(json.dumps(to_dict(coarse)))
+    if settings.exists() and json.loads(settings.read_text(encoding="utf-8")) != values:
+        raise ValueError(f"{settings.parent} has a fit with other --coarse_bindings; remove it")
+    write_json(settings, values)
     width = read_json(folder, folder / "transforms_train.json")["w"]
     train = load_blender(folder, "train", min(coarse.data.resolution or width, width))
     scene = prepare_views(coarse, train, train, box_tets(region.bounds), log)
@@ -241,7 +285,8 @@ def _main_parts(grid: OccupancyGrid, region: Region) -> OccupancyGrid:
     if not count:
         raise ValueError(
             "the coarse fit finds nothing opaque in the region of interest: give the object's box with "
-            "--box, more steps or resolution with --coarse_bindings, or masks (RGBA) and experiments/train.py"
+            "--box, more steps or resolution with --coarse_bindings, both in a new --workdir, or masks "
+            "(RGBA) and experiments/train.py"
         )
     centers = grid.centers
     label = labels[grid.occupied]
