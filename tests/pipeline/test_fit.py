@@ -14,7 +14,7 @@ from nimpostor_jax.io.images import composite
 from nimpostor_jax.io.mesh_files import save_tets
 from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.curve import HeldOutCurve
-from nimpostor_jax.pipeline.evaluate import evaluate, orbit, vertical
+from nimpostor_jax.pipeline.evaluate import evaluate, orbit, picture_name, vertical
 from nimpostor_jax.pipeline.fit import Progress, fit
 from nimpostor_jax.pipeline.prepare import prepare
 from nimpostor_jax.render.frame import _render_sharded
@@ -51,6 +51,16 @@ def test_killed_and_resumed_run_equals_one_that_was_not(bindings, cage, tmp_path
         np.testing.assert_array_equal(a, b)
     with (tmp_path / "b" / "log.csv").open() as file:
         assert [int(row["step"]) for row in csv.DictReader(file)] == [1, 2, 4, 6]
+
+
+def test_a_callback_may_keep_what_it_gets(bindings, cage):
+    config = load_config(bindings=[*bindings, "TrainConfig.eval_every=2"])
+    scene, kept = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None), []
+    trained, _ = fit(scene, callback=lambda impostor, step: kept.append(impostor), log=lambda _: None)
+    first, last = arrays(kept[0]), arrays(kept[-1])
+    assert np.abs(first[0] - last[0]).max() > 0
+    for a, b in zip(last, arrays(trained), strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_loss_falls_and_time_budget_ends_the_run(scene):
@@ -93,6 +103,13 @@ def test_evaluation_writes_pictures(scene, tmp_path):
     assert set(result) == {"psnr", "ssim", "lpips", "seconds_per_frame", "per_view"}
     assert result["lpips"] is None  # pictures of 25 pixels are too small for it
     assert len(result["per_view"]) == len(list(tmp_path.glob("*.png"))) == 2
+
+
+def test_pictures_of_equal_names_are_apart(scene):
+    views = scene.test.select([0, 1])
+    assert picture_name(views, 1) == views.names[1].split("/")[-1]
+    twins = dataclasses.replace(views, names=("left/0001.png", "right/0001.png"))
+    assert [picture_name(twins, i) for i in range(2)] == ["left_0001.png", "right_0001.png"]
 
 
 def test_schedule_follows_steps_or_the_clock(config):

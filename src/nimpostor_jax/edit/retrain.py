@@ -157,7 +157,7 @@ def _render_stage(
     devices = dividing_devices(config.rays_per_batch)
     if len(devices) > 1:
         mesh = device_mesh(devices)
-        state, new, region, pool = jax.device_put((state, new, region, pool), replicated(mesh))
+        state, new, region = jax.device_put((state, new, region), replicated(mesh))
         gradient, place = data_parallel(mesh), partial(jax.device_put, device=over_rays(mesh))
     step = partial(render_step, optimizer=optimizer, config=sized, gradient=gradient)
     compiled = jax.jit(step, donate_argnums=0)

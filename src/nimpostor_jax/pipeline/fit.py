@@ -97,17 +97,12 @@ def fit(
         progress = Progress(step=step, seconds=saved["seconds"], growths=saved["growths"])
         log(f"resuming {checkpoints} at step {step}")
 
-    impostor, pool, gradient, place = (
-        scene.impostor,
-        scene.pool,
-        loss_gradient,
-        (lambda batch: batch),
-    )
+    impostor, gradient, place = scene.impostor, loss_gradient, (lambda batch: batch)
     if len(devices) > 1:
         mesh = device_mesh(devices)
-        state, impostor, pool = jax.device_put((state, impostor, pool), replicated(mesh))
+        state, impostor = jax.device_put((state, impostor), replicated(mesh))
         gradient = data_parallel(mesh)
-        place = partial(jax.device_put, device=over_rays(mesh))
+        place = partial(jax.device_put, device=over_rays(mesh))  # of a batch; the pool is not copied
     state = jax.tree.map(jnp.copy, state)  # steps consume their state; the scene's arrays stay the caller's
     render = scene.render
     for _ in range(progress.growths):
@@ -134,7 +129,8 @@ def fit(
     clock = None  # starts after the first step of this process, which compiles
     try:
         while (done := progress.share(config, max_minutes)) < 1:
-            batch = place(draw_batch(key, progress.step, pool, config.rays_per_batch, config.background))
+            drawn = draw_batch(key, progress.step, scene.pool, config.rays_per_batch, config.background)
+            batch = place(drawn)
             if config.occupancy == "density" and progress.step % _OCCUPANCY_EVERY == 0:
                 state = update(key, state, impostor)
             rate = learning_rate(config, done, progress.step)
@@ -160,7 +156,8 @@ def fit(
                 save()
                 clock = time.perf_counter()
             if callback is not None and config.eval_every and progress.step % config.eval_every == 0:
-                callback(_trained(scene, state, devices), progress.step)
+                # A copy, which the callback may keep: the next step consumes the state.
+                callback(jax.tree.map(jnp.copy, _trained(scene, state, devices)), progress.step)
                 clock = time.perf_counter()
         save()
     finally:
