@@ -231,6 +231,14 @@ def test_frames_look_for_visible_samples_where_few_are(scene, bias, passes):
         assert frame_config(impostor, camera, integrated).min_weight == 0
 
 
+def test_another_view_keeps_its_samples(scene):
+    """Buffers are those of the view that they were measured on; how many samples a ray may have is not."""
+    impostor, _ = scene
+    far = scenes.camera(44, 40, position=(80.0, 60.0, 50.0))  # whose probe is of few and short rays
+    sized = frame_config(impostor, far, RENDER)
+    assert sized.sampler.max_samples_per_ray == refined(RENDER).sampler.max_samples_per_ray
+
+
 def test_to_image_blends_and_clips():
     frame = frames.Frame(
         color=np.array([[[0.2, 0.1, 0.0], [2.0, 0.0, 0.0]]]),

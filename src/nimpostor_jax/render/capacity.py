@@ -133,7 +133,9 @@ def fit_capacities(
     boundaries = step_boundaries(config.sampler)
     total = np.asarray(demand.total)
     wanted = np.clip(np.searchsorted(boundaries, total * (1 - 1e-5)), 0, len(boundaries) - 1)
-    most = min(config.sampler.max_samples_per_ray, _round_up(margin * wanted.max()))
+    most = config.sampler.max_samples_per_ray
+    if not of_frames:  # another view of the same config may have longer rays
+        most = min(most, _round_up(margin * wanted.max()))
     tets = np.asarray(demand.tets)
     planned = wanted.sum() if demand.planned is None else demand.planned
     most_tets = _round_up(margin * int(tets.max()))
