@@ -12,7 +12,7 @@ from nimpostor_jax.types import BakedImpostor, HashTables
 CHANNELS = 3
 
 
-def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), num_sets=1, finest=8):
+def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), depth=(0.0, 1.0), num_sets=1, finest=8):
     """Textures of 1 to `finest` texels along an edge, random opacities; decoder sets take turns."""
     made = scenes.impostor(name, dtype)
     rng = np.random.default_rng(seed)
@@ -30,7 +30,7 @@ def baked(name="blobs", dtype="float32", seed=0, opacity=(0.0, 1.0), num_sets=1,
     decoders, _ = principal_channels(several, products, CHANNELS)
     return BakedImpostor(
         mesh=made.mesh,
-        depths=tables(rng.uniform(size=seen.shape)),
+        depths=tables(rng.uniform(*depth, seen.shape)),
         opacities=tables(seen),
         textures=tables(rng.normal(size=(count, 4, CHANNELS))),
         decoders=decoders,

@@ -18,9 +18,10 @@ from scenes_baked import baked as baked_scene
 
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
 from nimpostor_jax.geometry.tetrahedron import FACES
+from nimpostor_jax.render import raster_frame
 from nimpostor_jax.render.baked import lit_segments, render_baked_rays, shade_segments
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.frame import frame_config, render_frame
+from nimpostor_jax.render.frame import for_frames, frame_config, render_frame
 from nimpostor_jax.render.raster_frame import rasterize_frame
 from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.types import TetMesh
@@ -38,10 +39,9 @@ def rays_at(impostor, kind=generic, seed=0):
     return as_rays((center + scale * origins, directions), impostor.mesh.vertices.dtype)
 
 
-def texel_lookup(tables, tet, place, leave):
+def texel_lookup(tables, tet, face, place, leave):
     """The numbers at a point of a face, by loops: three texels, four basis functions."""
     layout, values = tables.layout, np.asarray(tables.features, np.float64)
-    face = int(np.argmin(place))
     n, start = int(layout.resolutions[tet, face]), int(layout.starts[tet, face])
     a, b, _ = (place[i] for i in FACES[face])
     scaled = n * np.array([a, a + b])
@@ -59,11 +59,12 @@ def texel_lookup(tables, tet, place, leave):
 
 def tet_lookup(baked, tet, enter, leave):
     """What one ray sees in one tet: opacity, share of the way, channels times opacity."""
-    (share,) = texel_lookup(baked.depths, tet, enter, leave)
+    face = int(np.argmin(enter))
+    share = min(texel_lookup(baked.depths, tet, face, enter, leave).item(), 1)
     point = enter + share * (leave - enter)
-    point[int(np.argmin(enter))] = 0
-    (opacity,) = texel_lookup(baked.opacities, tet, point / point.sum(), leave)
-    return opacity, share, opacity * texel_lookup(baked.textures, tet, point / point.sum(), leave)
+    point[face] = 0
+    (opacity,) = texel_lookup(baked.opacities, tet, face, point / point.sum(), leave)
+    return opacity, share, opacity * texel_lookup(baked.textures, tet, face, point / point.sum(), leave)
 
 
 def mlp(layers, x, chosen):
@@ -73,11 +74,18 @@ def mlp(layers, x, chosen):
 
 
 @pytest.mark.parametrize(
-    ("overlapping", "least", "num_sets"), [(False, 0.0, 1), (True, 0.0, 1), (False, 0.05, 2), (True, 0.05, 2)]
+    ("overlapping", "least", "num_sets", "depth"),
+    [
+        (False, 0.0, 1, (0.0, 1.0)),
+        (True, 0.0, 1, (0.0, 1.0)),
+        (False, 0.05, 2, (0.0, 1.0)),
+        (True, 0.05, 2, (0.0, 1.0)),
+        (False, 0.0, 1, (1.1, 2.0)),  # at the exit: the place is on the edge of two faces
+    ],
 )
-def test_agrees_with_a_loop_over_tets(overlapping, least, num_sets, x64):
+def test_agrees_with_a_loop_over_tets(overlapping, least, num_sets, depth, x64):
     """Where tets overlap, what is seen first comes first. What contributes little is left out."""
-    baked = baked_scene(dtype="float64", opacity=(0.05, 0.95), num_sets=num_sets)
+    baked = baked_scene(dtype="float64", opacity=(0.05, 0.95), depth=depth, num_sets=num_sets)
     baked = pushed_together(baked) if overlapping else baked
     rays = rays_at(baked)
     output = render(baked, rays, dataclasses.replace(CONFIG, min_weight=least))
@@ -219,3 +227,27 @@ def test_a_camera_within_the_cage_is_refused(frames):
     inside = scenes.camera(50, 37, position=(-0.9, 0.5, 0.8), target=(0.9, 0.5, 0.4))
     with pytest.raises(ValueError, match=r"not in front of the camera; first: .*use render_frame"):
         rasterize_frame(baked, inside, config)
+
+
+def test_inverted_tets_are_refused(frames):
+    """A walk passes what they cover once, a rasterizer would three times."""
+    baked, camera, config, _, _ = frames
+    tet = baked.mesh.tets[5]
+    through = 2 * jnp.mean(baked.mesh.vertices[tet[1:]], axis=0) - baked.mesh.vertices[tet[0]]
+    moved = baked.replace(mesh=baked.mesh.replace(vertices=baked.mesh.vertices.at[tet[0]].set(through)))
+    with pytest.raises(ValueError, match=r"\d+ tets are inverted; first: \d+; use render_frame"):
+        rasterize_frame(moved, camera, config)
+
+
+def test_more_tets_in_a_tile_than_memory_is_for_are_refused(frames, monkeypatch):
+    baked, camera, config, _, _ = frames
+    monkeypatch.setattr(raster_frame, "MAX_TETS_PER_TILE", 8)
+    with pytest.raises(ValueError, match="tets meet in one tile of 16 x 16 pixels, more than 8; render more"):
+        rasterize_frame(baked, camera, config)
+
+
+def test_copies_on_all_devices_are_not_made_again(frames):
+    baked, camera, config, marched, _ = frames
+    ready = for_frames(baked)
+    assert len(ready.textures.features.sharding.device_set) == len(jax.local_devices()) > 1
+    assert_array_equal(render_frame(ready, camera, config).color, marched.color)

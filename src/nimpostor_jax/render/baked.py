@@ -148,14 +148,18 @@ def places_seen(
 
 
 def _place_seen(_: tuple, part: tuple) -> tuple[Float[Array, "chunk 4"], Float[Array, " chunk"]]:
-    """The point at a share of a segment, moved to the face of entry from the corner opposite."""
+    """The point at a share of a segment, moved to the face of entry from the corner opposite.
+
+    That corner's coordinate is -1 instead of 0, since the point may lie on another face as well: on the edge
+    between those of entry and exit, where all is seen at the exit. Lookups on a face do not read it.
+    """
     texels, lambda_enter, lambda_exit, t_enter, t_exit = part
     share = jnp.clip(in_basis(texels, lambda_exit)[:, 0], 0, 1)
     point = lambda_enter + share[:, None] * (lambda_exit - lambda_enter)
     opposite = jnp.arange(4) == face_of(lambda_enter)[:, None]
     on_face = jnp.where(opposite, 0, point)
     on_face /= jnp.maximum(jnp.sum(on_face, axis=1, keepdims=True), 1e-3)
-    return on_face, t_enter + share * (t_exit - t_enter)
+    return jnp.where(opposite, -1, on_face), t_enter + share * (t_exit - t_enter)
 
 
 def opacities_at(

@@ -10,6 +10,7 @@ from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Int
 
 from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
 from nimpostor_jax.render.baked import shade_segments
 from nimpostor_jax.render.camera import TILE, to_local
 from nimpostor_jax.render.capacity import MAX_GROWTH, grow_march
@@ -27,6 +28,8 @@ from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.types import BakedImpostor, Camera, RenderOutput
 
 CHUNK = 32  # tiles a call
+FLAT = 1e-6  # volume, of the cube around a tet, that rounding may give a sliver
+MAX_TETS_PER_TILE = 1 << 15  # a device needs some 30 kB for each: a few numbers for each pixel and edge
 
 _to_screen = jax.jit(to_screen)
 _bin_tets = jax.jit(bin_tets, static_argnames="capacity")
@@ -37,8 +40,15 @@ def rasterize_frame(baked: BakedImpostor, camera: Camera, config: RenderConfig) 
 
     Of that only the march's sizes, `near` and `min_weight` matter. Tiles with pixels that see more tets than
     there are layers are done again with more. Raises ValueError where a tet's vertex is not in front of the
-    camera, RuntimeError where 2**6 times the given sizes do not suffice.
+    camera, where tets are inverted (a walk passes what they cover once, a rasterizer three times), or where
+    more than `MAX_TETS_PER_TILE` meet in one tile of pixels; RuntimeError where 2**6 times the given sizes do
+    not suffice.
     """
+    positions = corners(baked.mesh.vertices, baked.mesh.tets)
+    extents = np.max(np.ptp(np.asarray(positions), axis=1), axis=1)
+    inverted = np.flatnonzero(np.asarray(signed_volumes(positions)) < -FLAT * extents**3)
+    if inverted.size:
+        raise ValueError(f"{inverted.size} tets are inverted; first: {inverted[0]}; use render_frame")
     screen, depth = _to_screen(baked.mesh, camera)
     used = np.unique(np.asarray(baked.mesh.tets))
     behind = used[~(np.asarray(depth)[used] > 0)]
@@ -49,6 +59,11 @@ def rasterize_frame(baked: BakedImpostor, camera: Camera, config: RenderConfig) 
         )
     lists = _all_lists(baked, screen, camera)
     lengths = np.diff(np.asarray(lists.starts))
+    if lengths.max() > MAX_TETS_PER_TILE:
+        raise ValueError(
+            f"{lengths.max()} tets meet in one tile of {TILE} x {TILE} pixels, more than "
+            f"{MAX_TETS_PER_TILE}; render more pixels, or use render_frame"
+        )
     tets_per_tile = _rounded(int(lengths.max()))
     pending = np.random.default_rng(0).permutation(np.flatnonzero(lengths))
     rows, columns = tiles_of(camera)
