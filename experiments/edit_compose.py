@@ -21,7 +21,7 @@ from edit_deform import load_run
 from nimpostor_jax.edit.compose import compose
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_runs, run_cli
 from nimpostor_jax.io.images import write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.pipeline.evaluate import write_json
@@ -43,8 +43,8 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     if args.size < 8:
         raise ValueError(f"--size must be >= 8, got {args.size}")
+    config = config_of_runs(args.workdirs, args)
     parts = [load_run(workdir, "DIR") for workdir in args.workdirs]
-    config = config_of_run(args.workdirs[0], args)
     transforms = read_transforms(args.transforms) if args.transforms else side_by_side(parts)
     whole = compose(parts, transforms)
     save_impostor(args.out / "impostor.npz", whole)

@@ -21,7 +21,7 @@ from nimpostor_jax.edit.boolean import gated
 from nimpostor_jax.edit.compose import compose
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_from_args, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_from_args, config_of_runs, run_cli
 from nimpostor_jax.io.images import write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.pipeline.fit import fit
@@ -49,7 +49,7 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     if args.size < 8:
         raise ValueError(f"--size must be >= 8, got {args.size}")
-    config = config_from_args(args)
+    config = config_from_args(args) if args.ball is None else config_of_runs([args.ball], args)
     if args.ball is not None:
         ball = load_run(args.ball, "fluffy_ball")
     else:

@@ -25,6 +25,7 @@ from nimpostor_jax.gin_flags import (
     TRACEBACK_VARIABLE,
     add_flags,
     config_from_args,
+    config_of_runs,
     load_config,
     operative_config_text,
     run_cli,
@@ -234,6 +235,28 @@ def test_flags_take_several_values_and_can_be_repeated(tmp_path):
     config = config_from_args(args)
     assert config.train == TrainConfig(steps=2, seed=1, log_every=2, warmup_steps=3)
     assert config.cage.target_tets == 30
+
+
+def test_runs_that_no_one_config_renders_are_refused(tmp_path):
+    """As training leaves them, and with a flag that makes them alike."""
+    parser = argparse.ArgumentParser()
+    add_flags(parser)
+    plain, color, early, length = (tmp_path / name for name in ("plain", "color", "early", "length"))
+    for folder, binding in (
+        (plain, ()),
+        (color, ["TrainConfig.steps=7"]),
+        (early, ["RenderConfig.integrate='features'"]),
+        (length, ["RenderConfig.density_measure='euclidean'"]),
+    ):
+        folder.mkdir()
+        (folder / "config.gin").write_text(operative_config_text(load_config([], binding)))
+    assert config_of_runs([color, plain], parser.parse_args([])).train.steps == 7
+    with pytest.raises(ValueError, match=r"integrate is 'features' in .*early and 'color' in .*plain"):
+        config_of_runs([plain, early], parser.parse_args([]))
+    bound = parser.parse_args(["--gin_bindings", "RenderConfig.integrate='features'"])
+    assert config_of_runs([plain, early], bound).render.integrate == "features"
+    with pytest.raises(ValueError, match="length measures density by length"):
+        config_of_runs([plain, length], parser.parse_args([]))
 
 
 def test_flags_default_to_nothing_and_keep_nothing_between_parsers():

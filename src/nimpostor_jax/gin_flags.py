@@ -115,6 +115,29 @@ def config_of_run(workdir: Path, args: argparse.Namespace) -> ExperimentConfig:
     return load_config([saved, *args.gin_configs], args.gin_bindings)
 
 
+def config_of_runs(workdirs: Sequence[Path], args: argparse.Namespace) -> ExperimentConfig:
+    """The first run's config, for what is made of several runs' fields; errors as `config_of_run`.
+
+    Raises ValueError for a run whose densities do not keep their meaning in another frame, and where one
+    rule of rendering does not fit all of the fields.
+    """
+    configs = [config_of_run(workdir, args) for workdir in workdirs]
+    for workdir, config in zip(workdirs, configs, strict=True):
+        if config.render.density_measure != "barycentric":
+            raise ValueError(
+                f"{workdir} measures density by length, which changes with the cage's frame; train it with "
+                "RenderConfig.density_measure='barycentric'"
+            )
+        for name in ("integrate", "directions"):
+            ours, first = (getattr(each.render, name) for each in (config, configs[0]))
+            if ours != first:
+                raise ValueError(
+                    f"RenderConfig.{name} is {ours!r} in {workdir} and {first!r} in {workdirs[0]}: one rule "
+                    "renders both; train them alike, or bind it"
+                )
+    return configs[0]
+
+
 def operative_config_text(config: ExperimentConfig) -> str:
     """Every field of a config as the text of a gin file, which `load_config` reads back equal."""
     return (
