@@ -37,7 +37,8 @@ def main(argv: Sequence[str]) -> None:
     config = load_config([CONFIG, *(args.gin_configs or [])], args.gin_bindings or [])
     started = time.perf_counter()
     use_all_cores()
-    scene = prepare(config, "fluffy_ball", cage_output=args.workdir / "cage.npz")
+    cage = args.workdir / "cage.npz"
+    scene = prepare(config, "fluffy_ball", cage=cage if cage.exists() else None, cage_output=cage)
     with atomic_path(args.workdir / "config.gin") as path:
         path.write_text(operative_config_text(config), encoding="utf-8")
     impostor, progress = fit(scene, max_minutes=args.minutes)

@@ -49,11 +49,11 @@ def train(
     own_cage = workdir / "cage.npz"
     cage = cage or (own_cage if own_cage.exists() else None)
     scene = prepare(config, data, cage=cage, cage_output=own_cage)
-    with atomic_path(workdir / "config.gin") as path:
-        path.write_text(operative_config_text(config), encoding="utf-8")
     curve = HeldOutCurve(scene, workdir / "curve.json") if config.train.eval_every else None
     impostor, progress = fit(scene, workdir=workdir, max_minutes=max_minutes, callback=curve)
     print(f"trained {progress.step} steps in {progress.seconds / 60:.1f} minutes")
+    with atomic_path(workdir / "config.gin") as path:  # a refused run's folder keeps its own
+        path.write_text(operative_config_text(config), encoding="utf-8")
     save_impostor(workdir / "impostor.npz", impostor)
     result = evaluate(
         impostor,

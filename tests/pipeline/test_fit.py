@@ -130,6 +130,18 @@ def test_checkpoint_of_another_configuration_is_refused(scene, bindings, cage, t
     other = load_config(bindings=[*bindings, "EncodingConfig.num_levels=2"])
     with pytest.raises(ValueError, match="num_levels"):
         fit(prepare(other, "fluffy_ball", cage=cage, log=lambda _: None), workdir=tmp_path)
+    render = dataclasses.replace(scene.config.render, integrate="features")
+    early = dataclasses.replace(scene, config=dataclasses.replace(scene.config, render=render))
+    with pytest.raises(ValueError, match=r"render\.integrate is 'color' there and 'features' here"):
+        fit(early, workdir=tmp_path)
+
+
+def test_a_folders_cage_stays_its_own(config, cage, tmp_path):
+    with np.load(cage) as data:
+        save_tets(tmp_path / "cage.npz", 1.01 * data["V"], data["T"])
+    with pytest.raises(ValueError, match=r"cage\.npz is another cage than .*cube\.npz"):
+        prepare(config, "fluffy_ball", cage=cage, cage_output=tmp_path / "cage.npz", log=lambda _: None)
+    prepare(config, "fluffy_ball", cage=cage, cage_output=cage, log=lambda _: None)
 
 
 def test_views_are_compared_over_their_own_backgrounds(scene):

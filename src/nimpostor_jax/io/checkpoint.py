@@ -27,7 +27,7 @@ from nimpostor_jax.types import TetMesh
 _KEPT_STEPS = 2
 _FORMAT_VERSION = 1
 # What gives the saved arrays their meaning. Other fields steer a run and may change at a resume.
-_BINDING_FIELDS = ("impostor", "render.density_measure")
+_BINDING_FIELDS = ("impostor", "render.density_measure", "render.integrate", "render.directions")
 
 
 def save_checkpoint(
@@ -87,10 +87,10 @@ def restore_checkpoint(
     """Restore a step (None: the latest) into the structure, dtypes and placement of `state_like`.
 
     Raises FileNotFoundError where there is no such checkpoint, and ValueError naming the first
-    difference and both values where the checkpoint has another impostor configuration or density
-    measure, other arrays, another cage (the tets of every `TetMesh` in the state), or other values
-    of the entries given in `metadata` (see `cage_fingerprint`). Nothing is read beyond the small
-    record before these checks, but the tets.
+    difference and both values where the checkpoint has another impostor configuration or another
+    way to render it (`_BINDING_FIELDS`), other arrays, another cage (the tets of every `TetMesh` in
+    the state), or other values of the entries given in `metadata` (see `cage_fingerprint`). Nothing
+    is read beyond the small record before these checks, but the tets.
     """
     folder = Path(folder).absolute()
     step = _existing_step(folder, step)

@@ -178,7 +178,8 @@ def load_cage(
 ) -> Cage:
     """The given cage file, checked against the views' foreground; or one built from the views' masks.
 
-    Where the config asks for a box, that around the given file's vertices.
+    Where the config asks for a box, that around the given file's vertices. Raises ValueError where
+    `cage_output` is there and is another cage.
     """
     if cage is None:
         check_masks(train)
@@ -193,7 +194,12 @@ def load_cage(
             missed = missed_foreground(vertices, tets, train.masks, *views)
             log(f"{cage}: {quality_report(vertices, tets)}; {missed}")
             check_coverage(missed, config.cage.max_missed_share, train.names, str(cage))
-    if cage_output is not None and not Path(cage_output).exists():  # an earlier run's stays its own
+    if cage_output is not None and Path(cage_output).exists():
+        of_run = load_tets(cage_output)
+        same = len(of_run[0]) == len(vertices) and np.array_equal(of_run[1], tets)
+        if not (same and np.allclose(of_run[0], vertices)):
+            raise ValueError(f"{cage_output} is another cage than {cage}; remove it or use another folder")
+    elif cage_output is not None:
         save_tets(cage_output, vertices, tets)
         log(f"cage saved as {cage_output}")
     return vertices, tets
