@@ -23,12 +23,12 @@ from nimpostor_jax.edit.boolean import difference, intersection, symmetric_diffe
 from nimpostor_jax.edit.remesh import consolidate
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_runs, run_cli
 from nimpostor_jax.io.blender import load_scene
 from nimpostor_jax.io.images import composite, read_image, write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.evaluate import camera_of, orbit, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, orbit, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.patterns import solid_from_image, solid_from_surface
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
@@ -53,7 +53,8 @@ def main(argv: Sequence[str]) -> None:
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
-    config, first = config_of_run(args.workdir, args), load_run(args.workdir, args.data)
+    config = config_of_runs([args.workdir] if args.other is None else [args.workdir, args.other], args)
+    first = load_run(args.workdir, args.data)
     out = args.out or args.workdir / "boolean"
     train, test = load_scene(resolve_scene(args.data), config.data)
     second = load_run(args.other, "DIR") if args.other is not None else pattern_of(args.pattern, first)
@@ -66,18 +67,18 @@ def main(argv: Sequence[str]) -> None:
         start = time.perf_counter()
         results["consolidated"] = consolidate(live, config.render, config.retrain)
         numbers["consolidate_seconds"] = time.perf_counter() - start
-    images = {}
+    images, behind = {}, test.background(0, config.data.background)
     for name, impostor in results.items():
         sized = frame_config(impostor, camera, config.render)
         render_frame(impostor, camera, sized)  # compiles
         start = time.perf_counter()
-        images[name] = to_image(render_frame(impostor, camera, sized))
+        images[name] = composite_frame(render_frame(impostor, camera, sized), behind)
         numbers[f"seconds_per_frame_{name}"] = time.perf_counter() - start
     if args.consolidate:
         numbers["psnr_consolidated_to_live"] = metrics.psnr(images["consolidated"], images["live"])
     result = list(results.values())[-1]
     save_impostor(out / "impostor.npz", result)
-    panel = [composite(test.images[0], "white"), *images.values()]
+    panel = [composite(test.images[0], behind), *images.values()]
     write_png(out / "before_after.png", np.concatenate(panel, axis=1))
     write_json(out / "boolean.json", numbers)
     if args.frames:

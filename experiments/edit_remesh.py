@@ -29,7 +29,7 @@ from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, orbit, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, evaluate, orbit, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.cage import cage_from_images
 from nimpostor_jax.preprocess.validate import check_tets
@@ -71,13 +71,14 @@ def main(argv: Sequence[str]) -> None:
     save_impostor(out / "impostor.npz", new)
 
     camera = camera_of(test, 0)
-    images = []
+    images, background = [], config.data.background
+    behind = test.background(0, background)
     for impostor in (old, new):
         sized = frame_config(impostor, camera, config.render)
-        images.append(to_image(render_frame(impostor, camera, sized)))
-    panel = [composite(test.images[0], "white"), *images, np.clip(4 * np.abs(images[0] - images[1]), 0, 1)]
+        images.append(composite_frame(render_frame(impostor, camera, sized), behind))
+    panel = [composite(test.images[0], behind), *images, np.clip(4 * np.abs(images[0] - images[1]), 0, 1)]
     write_png(out / "before_after.png", np.concatenate(panel, axis=1))
-    before, after = (evaluate(impostor, test, config.render) for impostor in (old, new))
+    before, after = (evaluate(each, test, config.render, background=background) for each in (old, new))
     result = {
         "psnr_before": before["psnr"],
         "psnr_after": after["psnr"],

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from nimpostor_jax.gin_flags import add_flags, config_from_args, run_cli
 from nimpostor_jax.io.blender import check_masks, load_scene
-from nimpostor_jax.io.mesh_files import save_tets
+from nimpostor_jax.io.mesh_files import check_cage_path, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.preprocess.cage import cage_from_images, cage_from_surface
 
@@ -25,6 +25,7 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--out", required=True, type=Path, help="cage file: .npz, .vtk, .vtu or .msh")
     add_flags(parser)
     args = parser.parse_args(argv)
+    check_cage_path(args.out)
     config = config_from_args(args)
     if args.surface is not None:
         cage = cage_from_surface(

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from nimpostor_jax.edit.deform import deform
-from nimpostor_jax.export.video import write_video
+from nimpostor_jax.export.video import check_video, write_video
 from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.blender import load_scene
 from nimpostor_jax.io.deformations import load_deformation
@@ -38,6 +38,7 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     if args.frames < 1:
         raise ValueError(f"--frames must be >= 1, got {args.frames}")
+    check_video(args.video, args.fps)
     config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
     if args.deformation is not None:
@@ -47,6 +48,8 @@ def main(argv: Sequence[str]) -> None:
     cameras = orbit(train, args.frames, size=args.size)
     sized = frame_config(impostor, cameras[0], config.render)
     background = 1.0 if config.data.background == "white" else 0.0
+    for earlier in (args.workdir / "orbit").glob("[0-9]*.png"):
+        earlier.unlink()  # frames beyond this video's would be taken for its end
     frames = []
     for i, camera in enumerate(cameras):
         frames.append(to_image(render_frame(impostor, camera, sized), background))

@@ -149,6 +149,8 @@ def test_edit_deform_compares_with_true_pictures(tmp_path):
         ("table1.py", ["--scene=fluffy_ball", "--out=W", "--cage=none.npz"], "none.npz does not exist"),
         ("table2.py", ["--scene", "a/mic", "b/mic", "--out=W"], "different names"),
         ("make_cage.py", ["--surface=none.obj", "--out=W/c.npz"], "none.obj"),
+        ("make_cage.py", ["--data=fluffy_ball", "--out=W/c.obj"], "unknown cage format '.obj'"),
+        ("render.py", ["--data=fluffy_ball", "--workdir=W", "--video=o.gif", "--fps=60"], "0.01 to 50 fps"),
         ("capture.py", ["--data=nowhere", "--workdir=W"], "nowhere"),
         ("capture.py", ["--data=nowhere", "--workdir=W", "--coarse_bindings=TrainConfig.stepz=1"], "steps"),
         ("capture.py", ["--data=.", "--workdir=W", "--box", "0", "0", "0", "1", "1", "0"], "--box"),

@@ -21,11 +21,23 @@ _MAX_GIF_FPS = 50.0  # GIF counts in 1/100 s, and viewers slow anything under 2/
 
 def write_video(path: str | Path, frames: Frames, fps: float) -> None:
     """Write `.gif` or `.mp4`, by suffix; ValueError for another. Errors as in the two writers."""
-    writers = {".gif": write_gif, ".mp4": write_mp4}
+    check_video(path, fps)
+    writer = write_gif if Path(path).suffix.lower() == ".gif" else write_mp4
+    writer(path, frames, fps)
+
+
+def check_video(path: str | Path, fps: float) -> None:
+    """Raise ValueError for a suffix that `write_video` does not write, and `fps` that it does not play."""
     suffix = Path(path).suffix.lower()
-    if suffix not in writers:
-        raise ValueError(f"{path}: the suffix must be one of {', '.join(writers)}")
-    writers[suffix](path, frames, fps)
+    if suffix not in (".gif", ".mp4"):
+        raise ValueError(f"{path}: the suffix must be one of .gif, .mp4")
+    if suffix == ".gif" and not _MIN_GIF_FPS <= fps <= _MAX_GIF_FPS:
+        raise ValueError(
+            f"{path}: a GIF plays at {_MIN_GIF_FPS:g} to {_MAX_GIF_FPS:g} fps, got {fps}; "
+            "write an MP4"
+        )
+    if not 0 < fps < float("inf"):
+        raise ValueError(f"{path}: fps must be positive, got {fps}")
 
 
 def write_gif(path: str | Path, frames: Frames, fps: float) -> None:
@@ -34,11 +46,7 @@ def write_gif(path: str | Path, frames: Frames, fps: float) -> None:
     Frame times are rounded to 1/100 s. Raises ValueError for frames that are none, unequal, not
     `[H, W, 3]` or not finite (naming the first), and for `fps` outside [0.01, 50].
     """
-    if not _MIN_GIF_FPS <= fps <= _MAX_GIF_FPS:
-        raise ValueError(
-            f"{path}: a GIF plays at {_MIN_GIF_FPS:g} to {_MAX_GIF_FPS:g} fps, got {fps}; "
-            "write an MP4"
-        )
+    check_video(Path(path).with_suffix(".gif"), fps)
     pixels = _checked_frames(path, frames)
     duration = 10 * round(100.0 / fps)  # milliseconds
     with atomic_path(path) as partial:
@@ -52,8 +60,7 @@ def write_mp4(path: str | Path, frames: Frames, fps: float) -> None:
     for. Raises ValueError as `write_gif` (`fps` need only be positive), RuntimeError where no
     ffmpeg is found.
     """
-    if not 0 < fps < float("inf"):
-        raise ValueError(f"{path}: fps must be positive, got {fps}")
+    check_video(Path(path).with_suffix(".mp4"), fps)
     pixels = _checked_frames(path, frames)
     _, height, width, _ = pixels.shape
     pixels = np.pad(pixels, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), mode="edge")

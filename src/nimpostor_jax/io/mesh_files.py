@@ -32,7 +32,7 @@ def load_tets(
             fails `preprocess.validate.check_tets`.
     """
     path = Path(path)
-    _check_suffix(path)
+    check_cage_path(path)
     check_exists(path, "cage")
     vertices, tets = _read_npz(path) if path.suffix == ".npz" else _read_meshio(path)
     if orient and len(tets) and tets.min() >= 0 and tets.max() < len(vertices):
@@ -50,7 +50,7 @@ def save_tets(
         ValueError: unknown suffix, or a mesh that fails `preprocess.validate.check_tets`.
     """
     path = Path(path)
-    _check_suffix(path)
+    check_cage_path(path)
     check_tets(vertices, tets, str(path))
     vertices, tets = np.asarray(vertices, np.float64), np.asarray(tets, np.int32)
     with atomic_path(path) as partial:
@@ -61,7 +61,10 @@ def save_tets(
             mesh.write(partial, file_format=_MESHIO_FORMATS[path.suffix])
 
 
-def _check_suffix(path: Path) -> None:
+def check_cage_path(path: Path) -> None:
+    """Raise ValueError for a file name that is no cage's, and for a folder."""
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder; name a cage file in it")
     if path.suffix not in _SUFFIXES:
         raise ValueError(
             f"{path}: unknown cage format {path.suffix!r}; use one of {', '.join(_SUFFIXES)}"

@@ -23,6 +23,7 @@ def solid_from_surface(
 ) -> GridSolid:
     """A closed surface (file or trimesh) as a solid, exact to a voxel: 1 / `resolution` of its longest side.
 
+    Cavities are filled: subtract a solid of their own where they matter.
     Raises FileNotFoundError and ValueError as `preprocess.cage.cage_from_surface`.
     """
     source = "surface" if isinstance(surface, trimesh.Trimesh) else str(surface)
