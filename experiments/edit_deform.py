@@ -30,7 +30,7 @@ from nimpostor_jax.io.deformations import load_deformation
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, picture_name, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.pipeline.ray_bending import BentField
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
@@ -243,7 +243,7 @@ def ray_bending(
         true = composite(views.images[i], config.data.background)
         rows.append({"view": name, "psnr": metrics.psnr(image, true), "ssim": metrics.ssim(image, true)})
         panel = [true, image, np.clip(4 * np.abs(true - image), 0, 1)]
-        write_png(folder / "ray_bending" / f"{Path(name).stem}.png", np.concatenate(panel, axis=1))
+        write_png(folder / "ray_bending" / picture_name(views, i), np.concatenate(panel, axis=1))
     mean = {f"{key}_deformed": float(np.mean([row[key] for row in rows])) for key in ("psnr", "ssim")}
     return mean | {"views": len(views), "seconds": time.perf_counter() - start, "per_view": rows}
 

@@ -233,10 +233,12 @@ def test_frames_look_for_visible_samples_where_few_are(scene, bias, passes):
 
 def test_another_view_keeps_its_samples(scene):
     """Buffers are those of the view that they were measured on; how many samples a ray may have is not."""
-    impostor, _ = scene
-    far = scenes.camera(44, 40, position=(80.0, 60.0, 50.0))  # whose probe is of few and short rays
-    sized = frame_config(impostor, far, RENDER)
-    assert sized.sampler.max_samples_per_ray == refined(RENDER).sampler.max_samples_per_ray
+    impostor, camera = scene
+    sampler = dataclasses.replace(RENDER.sampler, max_samples_per_ray=4096)  # more than any ray needs
+    config = dataclasses.replace(RENDER, sampler=sampler)
+    sized = frame_config(impostor, camera, config).sampler
+    assert sized.max_samples_per_ray == refined(config).sampler.max_samples_per_ray
+    assert sized.capacity_per_ray < 200  # measured
 
 
 def test_to_image_blends_and_clips():

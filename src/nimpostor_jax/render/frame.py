@@ -27,7 +27,6 @@ CHUNK = 8192  # rays a call
 MAX_REFINEMENT = 32  # of the steps, to meet a tolerance
 REPAIR_CHUNK = 1024  # rays a call with buffers of the largest size
 
-
 Rendered = TypeVar("Rendered", NeuralImpostor, BakedImpostor)
 Tree = TypeVar("Tree")
 
