@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scenes
-from meshes import MESHES
+from meshes import MESHES, oriented
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.spatial import Delaunay
 from scipy.spatial.transform import Rotation
 
 from nimpostor_jax.config import RetrainConfig
 from nimpostor_jax.edit import visibility
 from nimpostor_jax.edit.boolean import gated, union
-from nimpostor_jax.edit.deform import deform, rigid, stretch
+from nimpostor_jax.edit.deform import deform, rigid, stretch, twist
 from nimpostor_jax.edit.probe import draw_points, occupancy_of
 from nimpostor_jax.edit.region import Region, trained_part, with_region, with_trained_part
 from nimpostor_jax.edit.remesh import consolidate, overlay, transfer
@@ -97,6 +98,23 @@ def test_a_local_change_leaves_all_other_tets_their_bits():
     assert_array_equal(index, trained.astype(int))
 
 
+def test_only_decoders_of_changed_tets_are_copied():
+    """So that edit after edit adds sets, and does not double them."""
+    made = scenes.impostor("delaunay")
+    decoders = jax.tree.map(lambda x: jnp.concatenate([x, x + 1, x + 2]), made.decoders)
+    cells = np.arange(len(made.mesh.tets))
+    made = made.replace(decoders=decoders, decoder_index=jnp.asarray(cells % 3, jnp.int32))
+    places = np.broadcast_to(np.eye(4), (len(cells), 4, 4))
+    for changed, sets in ((cells % 3 == 1, [3]), (cells % 3 != 1, [3, 4]), (cells >= 0, [0, 1, 2])):
+        new, region = with_region(made, made.mesh, np.where(changed, -1, cells), places, cells)
+        assert_array_equal(region.decoder_sets, sets)
+        placed = cells if new.embedding is None else np.asarray(new.embedding.cells)
+        index = np.asarray(new.decoder_index)[placed]
+        bias = [np.asarray(x.decoders["density"][0]["bias"]) for x in (made, new)]
+        assert_array_equal(bias[1][index], bias[0][cells % 3])  # new sets begin as the old ones
+        assert len(bias[1]) == (3 if len(sets) == 3 else 3 + len(sets))
+
+
 def test_a_whole_new_cage_trains_all_entries_in_order():
     """Then rows are neither gathered nor scattered."""
     made = scenes.impostor("delaunay")
@@ -158,6 +176,36 @@ def test_cut_tets_go_on_in_the_old_field_exactly():
     new = transfer(made, vertices, tets, CONFIG, QUICK, quiet)
     assert new.tables.features.shape == made.tables.features.shape
     assert_allclose(picture(new), picture(made), atol=1e-4)
+
+
+def test_the_same_tets_are_kept_where_the_cage_overlaps_itself():
+    """And others are refused there: nothing says in which of the old ones they lie."""
+    made = scenes.pushed_together(scenes.impostor("blobs"))
+    vertices, tets = np.asarray(made.mesh.vertices, np.float64), np.asarray(made.mesh.tets)
+    turned = tets[:, [1, 2, 0, 3]]
+    over = overlay(made, vertices, turned)
+    assert_array_equal(over.tets, np.arange(len(tets)))
+    assert_array_equal(over.lambdas, np.broadcast_to(np.eye(4)[[1, 2, 0, 3]], (len(tets), 4, 4)))
+    fine = subdivide(made)
+    with pytest.raises(ValueError, match="lie where the old cage overlaps itself"):
+        overlay(made, np.asarray(fine.mesh.vertices, np.float64), np.asarray(fine.mesh.tets))
+
+
+def test_vertices_that_stay_come_to_rest_where_they_were():
+    """Whatever tets they belong to now, which the tets around them do not share."""
+    made = deform(scenes.impostor("delaunay"), twist(0.3))
+    vertices = world_vertices(made.mesh)
+    inner = vertices[np.asarray(made.mesh.tets[:3])].mean(axis=1)
+    vertices = np.concatenate([vertices, inner])
+    _, tets = oriented(vertices, Delaunay(vertices).simplices)
+    config = dataclasses.replace(QUICK, max_lost_share=1.0, feature_steps=0, render_steps=0)
+    new = transfer(made, vertices, tets, CONFIG, config, quiet)
+    old_cells = np.asarray(new.embedding.cells) < len(made.mesh.tets)
+    assert 0 < old_cells.sum() < len(tets)  # some tets stay, and some do not
+    assert_array_equal(new.rest_vertices[:-3], made.rest_vertices)
+    # the new ones: the middles of tets stay their middles
+    rest = np.asarray(made.rest_vertices)[np.asarray(made.mesh.tets[:3])].mean(axis=1)
+    assert_allclose(new.rest_vertices[-3:], rest, atol=1e-5)
 
 
 def test_a_moved_cage_is_remeshed_where_it_stands():

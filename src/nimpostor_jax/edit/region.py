@@ -1,6 +1,7 @@
 """Cells of their own for the tets that an edit changes, beside a field that stays to the last bit (Sec. 4.2).
 
-A region's tables stand behind those of the old field, level by level, and its decoders are copies. What is
+A region's tables stand behind those of the old field, level by level, and its decoders are copies of those
+that its tets had. What is
 trained is taken out and put back by index, so that nothing else can change.
 
 Host code but for `trained_part` and `with_trained_part`. Axes: T tets of the mesh, C cells, D decoder sets.
@@ -61,11 +62,13 @@ def with_region(
         layouts = [own] if alone else [layout, own]
         layout = own if alone else join_layouts(layouts)
         features, entries = _own_entries(None if alone else field.tables, own, layout, features)
+        used, slots = np.unique(np.asarray(field.decoder_index)[like[changed]], return_inverse=True)
         first = 0 if alone else num_sets
-        sets = np.arange(first, first + num_sets)
+        sets = np.arange(first, first + len(used))
+        copies = jax.tree.map(lambda x: x[used], decoders)
         if not alone:
-            decoders = jax.tree.map(lambda x: jnp.concatenate([x, x]), decoders)
-        index = np.concatenate([index, first + np.asarray(field.decoder_index)[like[changed]]])
+            copies = jax.tree.map(lambda x, new: jnp.concatenate([x, new]), decoders, copies)
+        decoders, index = copies, np.concatenate([index, first + slots])
     placed = cells.copy()
     placed[changed] = num_cells + np.arange(len(changed))
     places = lambdas.copy()

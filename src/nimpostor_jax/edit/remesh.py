@@ -23,6 +23,7 @@ from nimpostor_jax.geometry.locate import locate
 from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
+_SAME = 1e-6  # in the mesh's frame: how far apart vertices are the same
 _INSIDE = 1e-6  # in the mesh's frame: how far beyond a face rounding may put a corner
 _PROBES = 1 << 16
 _LOOKS, _POINTS_A_LOOK = 32, 64  # into tets of which perhaps nothing is left, until something is found
@@ -51,7 +52,8 @@ def transfer(
 
     Raises:
         ValueError: a bad mesh, live operations or several objects in the impostor, cages that do not overlap,
-            or more than `config.max_lost_share` of what the old field shows outside of the new cage.
+            more than `config.max_lost_share` of what the old field shows outside of the new cage, or new tets
+            where the old cage overlaps itself (found by the middles of its tets).
     """
     if old.gates or old.paints:
         raise ValueError("consolidate live operations (gates, paints) before the impostor is remeshed")
@@ -59,9 +61,9 @@ def transfer(
     if len(np.unique(np.asarray(mesh.object_ids))) > 1:
         raise ValueError("the impostor has several objects: remesh them one by one, and compose the results")
     local = (np.asarray(vertices, np.float64) - np.asarray(mesh.center)) / np.float64(mesh.scale)
+    twins = twins_of(mesh, local)
     # Vertices that are the old ones keep their bits.
-    distance, twin = cKDTree(np.asarray(mesh.vertices, np.float64)).query(local)
-    local = np.where((distance < 1e-6)[:, None], np.asarray(mesh.vertices, np.float64)[twin], local)
+    local = np.where(twins[:, None] >= 0, np.asarray(mesh.vertices, np.float64)[twins], local)
     new_mesh = build_in_frame(mesh, local, tets)
     lost = lost_share(old, new_mesh)
     log(f"{lost:.3%} of what the field shows lies outside the new cage")
@@ -77,7 +79,7 @@ def transfer(
         lambdas = lambdas @ np.asarray(old.embedding.lambdas, np.float64)[np.maximum(over.tets, 0)]
     new, region = with_region(old, new_mesh, cells, lambdas, _cells(old, over.nearest))
     if old.rest_vertices is not None:
-        new = dataclasses.replace(new, rest_vertices=_at_rest(old, local, np.asarray(tets), over.nearest))
+        new = dataclasses.replace(new, rest_vertices=_at_rest(old, local, np.asarray(tets), over))
     log(f"{len(tets)} tets, {region.tets.size} of them to be trained")
     return retrain(old, new, region, render, config, log)
 
@@ -151,17 +153,40 @@ def _cells(impostor: NeuralImpostor, tets: Int[np.ndarray, " n"]) -> Int[np.ndar
     return held if impostor.embedding is None else np.asarray(impostor.embedding.cells)[held]
 
 
+def twins_of(mesh: TetMesh, local: Float[np.ndarray, "V 3"]) -> Int[np.ndarray, " V"]:
+    """The mesh's vertex at each point of its frame, or -1."""
+    distance, nearest = cKDTree(np.asarray(mesh.vertices, np.float64)).query(local)
+    return np.where(distance < _SAME, nearest, -1)
+
+
 def overlay(
     old: NeuralImpostor, local: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]
 ) -> Overlay:
-    """Which new tets lie within single old ones, as both stand; vertices in the old mesh's frame."""
+    """Which new tets lie within single old ones, as both stand; vertices in the old mesh's frame.
+
+    Tets of the same vertices are the same, also where the old cage overlaps itself. Raises ValueError for
+    other tets there: nothing says which of the old ones they are to go on in.
+    """
     corners = local[tets]
     middles = corners.mean(axis=1)
-    world = np.asarray(old.mesh.center) + np.float64(old.mesh.scale) * middles
-    found = np.asarray(locate(old.mesh, jnp.asarray(world, old.mesh.vertices.dtype))[0])
-    old_corners = np.asarray(old.mesh.vertices, np.float64)[np.asarray(old.mesh.tets)]
-    _, near = cKDTree(old_corners.mean(axis=1)).query(middles)
+    old_tets = np.asarray(old.mesh.tets)
+    old_corners = np.asarray(old.mesh.vertices, np.float64)[old_tets]
+    old_middles = old_corners.mean(axis=1)
+    same = _same_tets(old_tets, twins_of(old.mesh, local)[tets])
+    found = np.where(same >= 0, same, _located(old.mesh, middles))
+    _, near = cKDTree(old_middles).query(middles)
     nearest = np.where(found >= 0, found, near)
+    own = _located(old.mesh, old_middles)
+    # A sliver that a deformation turned inside out is no fold: its place is that of its neighbours.
+    upright = np.linalg.det(old_corners[:, 1:] - old_corners[:, :1]) > 0
+    twice = np.flatnonzero(upright & (own >= 0) & upright[own] & (own != np.arange(len(own))))
+    unclear = (same < 0) & np.isin(found, np.concatenate([twice, own[twice]]))
+    if unclear.any():
+        raise ValueError(
+            f"{unclear.sum()} of {len(tets)} new tets (first: {np.argmax(unclear)}) lie where the old cage "
+            "overlaps itself, so that their field is not defined; remesh before the cage is folded, or keep "
+            "its tets there"
+        )
     edges = (old_corners[:, 1:] - old_corners[:, :1])[nearest]  # [T, 3, 3], rows are edges
     flat = np.abs(np.linalg.det(edges)) <= 0
     edges = np.where(flat[:, None, None], np.eye(3), edges)
@@ -175,15 +200,30 @@ def overlay(
     return Overlay(tets=np.where(within, nearest, -1), lambdas=lambdas, nearest=nearest)
 
 
+def _same_tets(old: Int[np.ndarray, "O 4"], new: Int[np.ndarray, "T 4"]) -> Int[np.ndarray, " T"]:
+    """The old tet of the same four vertices, or -1; new tets name old vertices, or -1."""
+    rows = np.sort(np.concatenate([old, new]), axis=1)
+    _, kinds = np.unique(rows, axis=0, return_inverse=True)
+    tet_of = np.full(kinds.max() + 1, -1)
+    tet_of[kinds[: len(old)]] = np.arange(len(old))
+    return tet_of[kinds[len(old) :]]
+
+
+def _located(mesh: TetMesh, local: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """The mesh's tets that hold points of its frame, or -1."""
+    world = np.asarray(mesh.center) + np.float64(mesh.scale) * local
+    return np.asarray(locate(mesh, jnp.asarray(world, mesh.vertices.dtype))[0])
+
+
 def _at_rest(
-    old: NeuralImpostor,
-    local: Float[np.ndarray, "V 3"],
-    tets: Int[np.ndarray, "T 4"],
-    nearest: Int[np.ndarray, " T"],
+    old: NeuralImpostor, local: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"], over: Overlay
 ) -> jnp.ndarray:
-    """Where new vertices were before the old cage moved: by the old tet around one of their tets."""
-    owner = np.zeros(len(local), int)
-    owner[tets.reshape(-1)] = np.repeat(nearest, 4)
+    """Where vertices were before the old cage moved: those that are new, by the old tet around them."""
+    owner, around = np.zeros(len(local), int), _located(old.mesh, local)
+    owner[tets.reshape(-1)] = np.repeat(over.nearest, 4)
+    owner = np.where(around >= 0, around, owner)
+    kept = over.tets >= 0
+    owner[tets[kept].reshape(-1)] = np.repeat(over.tets[kept], 4)
     old_tets = np.asarray(old.mesh.tets)[owner]
     moved, rest = (
         np.asarray(x, np.float64)[old_tets] for x in (old.mesh.vertices, old.rest_vertices)
@@ -191,6 +231,8 @@ def _at_rest(
     inverse = np.linalg.pinv(moved[:, 1:] - moved[:, :1])
     weights = np.einsum("vx,vxe->ve", local - moved[:, 0], inverse)
     placed = rest[:, 0] + np.einsum("ve,vex->vx", weights, rest[:, 1:] - rest[:, :1])
+    twins = twins_of(old.mesh, local)
+    placed = np.where(twins[:, None] >= 0, np.asarray(old.rest_vertices)[twins], placed)
     return jnp.asarray(placed, old.mesh.vertices.dtype)
 
 
