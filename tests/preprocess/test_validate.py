@@ -133,7 +133,7 @@ def _broken(kind):
         ("negative", r"1 tets with indices outside 0..7 \(first: 2\)"),
         ("inverted", r"1 inverted tets .*\(first: 4\); call orient_tets"),
         ("degenerate", r"1 degenerate tets .*\(first: 5\)"),
-        ("triple", r"4 faces belong to more than two tets"),
+        ("triple", r"tet \d+: its face \(.*\) belongs to more than two tets"),
         ("float", r"tets must be integers"),
         ("empty", r"no tets"),
     ],

@@ -17,19 +17,32 @@ MAX_FACE_CLUSTERS = 1 << 15
 
 
 def adjacency(tets: Int[np.ndarray, "T 4"]) -> Int[np.ndarray, "T 4"]:
-    """The tet across the face opposite each corner, -1 outside. Raises where a face has three tets."""
-    faces = np.sort(tets[:, _FACE_CORNERS].reshape(-1, 3), axis=1)
+    """The tet across the face opposite each corner, -1 outside.
+
+    Raises ValueError where a face has three tets, or two on the same side of it.
+    """
+    as_seen = tets[:, _FACE_CORNERS].reshape(-1, 3)  # counter-clockwise, from outside of their tets
+    faces = np.sort(as_seen, axis=1)
     order = np.lexsort(faces.T[::-1])
     ordered = faces[order]
     same = np.all(ordered[1:] == ordered[:-1], axis=1)
     if np.any(same[1:] & same[:-1]):
         first = order[np.flatnonzero(same[1:] & same[:-1])[0]]
         raise ValueError(
-            f"tet {first // 4}: its face {tuple(faces[first])} belongs to more than two tets; "
+            f"tet {first // 4}: its face {tuple(faces[first].tolist())} belongs to more than two tets; "
             "split the mesh there or remove the duplicate tets"
         )
     neighbors = np.full(len(faces), -1, np.int32)
     left, right = order[:-1][same], order[1:][same]
+    ascends = as_seen < np.roll(as_seen, -1, axis=1)
+    even = ascends.sum(axis=1) == 2  # a cyclic permutation of the sorted corners
+    if np.any(even[left] == even[right]):
+        first = np.argmax(even[left] == even[right])
+        raise ValueError(
+            f"tets {left[first] // 4} and {right[first] // 4} lie on the same side of their common face "
+            f"{tuple(faces[left[first]].tolist())}: the mesh is folded there, or has a tet twice; remesh it "
+            "or remove the duplicate tets"
+        )
     neighbors[left] = right // 4
     neighbors[right] = left // 4
     return neighbors.reshape(-1, 4)
@@ -46,9 +59,10 @@ def build_tet_mesh(
     """A TetMesh from world-space vertices and positively oriented tets.
 
     The mesh is stored relative to the centre of its bounding box and half the box's diagonal, computed in
-    float64, so that float32 results depend neither on where the object stands nor on its size. Raises
-    ValueError for shapes, indices, non-finite vertices, and (naming the first) inverted or flat tets, unless
-    the mesh is `deformed`: its tets were positively oriented once.
+    float64, so that float32 results depend neither on where the object stands nor on its size. Vertices that
+    no tet uses do not count there. Raises ValueError for shapes, types, indices, non-finite vertices, as
+    `adjacency`, and (naming the first) for inverted or flat tets, unless the mesh is `deformed`: then its
+    tets were positively oriented once.
     """
     vertices = np.asarray(vertices, np.float64)
     tets = np.asarray(tets)
@@ -62,6 +76,10 @@ def build_tet_mesh(
         raise ValueError(
             f"expected vertices [V,3] and tets [T,4], T >= 1; got {vertices.shape}, {tets.shape}"
         )
+    if not np.issubdtype(tets.dtype, np.integer):
+        raise ValueError(f"tets must be integers, got {tets.dtype}")
+    if object_ids is not None and np.shape(object_ids) != (len(tets),):
+        raise ValueError(f"expected an object id for each of {len(tets)} tets, got {np.shape(object_ids)}")
     if tets.min() < 0 or tets.max() >= len(vertices):
         bad = np.flatnonzero((tets < 0).any(1) | (tets >= len(vertices)).any(1))[0]
         raise ValueError(
@@ -77,8 +95,11 @@ def build_tet_mesh(
             f"{inverted.size} of {len(tets)} tets are inverted or flat (first: {inverted[0]}); "
             "call preprocess.validate.orient_tets, or remove flat tets"
         )
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    center, scale = (low + high) / 2, np.linalg.norm(high - low) / 2
+    used = vertices[np.unique(tets)]
+    low, high = used.min(axis=0), used.max(axis=0)
+    # As they are stored: what `dtype` rounds here is not lost, but in the local vertices.
+    center = ((low + high) / 2).astype(dtype).astype(np.float64)
+    scale = (np.linalg.norm(high - low) / 2).astype(dtype).astype(np.float64)
     local = (vertices - center) / scale
     neighbors = adjacency(tets)
     return TetMesh(

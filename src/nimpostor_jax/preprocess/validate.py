@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from nimpostor_jax.geometry.topology import adjacency
 from nimpostor_jax.preprocess.visual_hull import FOREGROUND_ALPHA, view_label
 
 # Corner triples of the face opposite each corner, outward for a positively oriented tet.
@@ -105,8 +106,8 @@ def check_tets(
     """Raise ValueError, naming `source` and the first offender, unless the arrays are a sound tet
     mesh.
 
-    Sound: finite vertices, indices in range, positive and non-degenerate volumes, no face in more
-    than two tets. Overlap is not an error here (edited cages may overlap); see `quality_report`.
+    Sound: finite vertices, indices in range, positive and non-degenerate volumes, at most one tet on
+    either side of a face. Overlap is not an error here (edited cages may overlap); see `quality_report`.
     """
     vertices, tets = np.asarray(vertices), np.asarray(tets)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or tets.ndim != 2 or tets.shape[1] != 4:
@@ -137,14 +138,10 @@ def check_tets(
         "inverted tets (negative volume)",
         "call orient_tets, or load with orient=True",
     )
-    faces = np.sort(tets[:, FACES].reshape(-1, 3), axis=1)
-    unique, counts = np.unique(faces, axis=0, return_counts=True)
-    if (counts > 2).any():
-        face = unique[np.argmax(counts > 2)]
-        raise ValueError(
-            f"{source}: {int((counts > 2).sum())} faces belong to more than two tets (first: "
-            f"vertices {face.tolist()}, up to {int(counts.max())} tets); remove duplicate tets"
-        )
+    try:
+        adjacency(tets)
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
 
 
 def _fail(source: str, bad: np.ndarray, what: str, remedy: str) -> None:
