@@ -4,14 +4,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scenes
 from jax.extend.core import jaxprs_in_params
-from meshes import grid
-from rays import as_rays
+from meshes import grid, local_vertices
+from rays import as_rays, generic
 from scenes import FIELD
 
 from nimpostor_jax.config import MarchConfig, RenderConfig, SamplerConfig
+from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.field.impostor import init_impostor
 from nimpostor_jax.geometry.topology import build_tet_mesh
+from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.renderer import render_rays
 from nimpostor_jax.render.traverse import march_tables, traverse
 
@@ -35,6 +38,20 @@ def largest_intermediate(jaxpr):
         for inner in jaxprs_in_params(equation.params):
             largest = max(largest, largest_intermediate(inner))
     return largest
+
+
+def test_buffers_of_cut_tets_are_those_of_their_cells():
+    """Steps are measured in cells: halving tets makes no more of them."""
+    made = scenes.impostor("delaunay")
+    rays = as_rays(generic(*local_vertices(made.mesh), np.random.default_rng(0), 64))
+    rays = rays.replace(origins=made.mesh.center + made.mesh.scale * rays.origins)
+    config = scenes.exact(max_samples_per_ray=512, step=0.1)
+    fine = subdivide(subdivide(made))
+    sizes = [
+        fit_capacities(m.mesh, march_tables(m.mesh), rays, config, embedding=m.embedding).sampler
+        for m in (made, fine)
+    ]
+    assert sizes[0] == sizes[1] and sizes[0].capacity_per_ray < 512
 
 
 def test_traversal_holds_rays_times_slots(large, optimized):

@@ -102,6 +102,7 @@ def test_sums_by_ray_and_their_gradients(rng, x64, monkeypatch):
         return sum_by_ray(weights, values, jnp.asarray(rays), 4, jnp.int32(used))
 
     assert_allclose(ours(weights, values), plain(weights, values), rtol=1e-12)
+    assert_array_equal(ours(weights, values.at[used:].set(jnp.nan)), ours(weights, values))
     of = (jax.grad(lambda *a, f=f: jnp.sum(mix * f(*a)), (0, 1)) for f in (ours, plain))
     for mine, theirs in zip(*(gradient(weights, values) for gradient in of), strict=True):
         assert_allclose(mine, theirs, rtol=1e-12)

@@ -11,9 +11,9 @@ from rays import DEGENERATE, GENERIC, as_rays, by_ray
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry.tetrahedron import num_inverted
 from nimpostor_jax.geometry.topology import build_tet_mesh
-from nimpostor_jax.render import entries
+from nimpostor_jax.render import capacity, entries
 from nimpostor_jax.render.segments import locate_segments
-from nimpostor_jax.render.traverse import march_tables, traverse
+from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
 
 CONFIG = MarchConfig(max_tets_per_ray=40, max_entries_per_ray=4, tile_size=64)
 COUNT = 32
@@ -58,7 +58,8 @@ def test_a_collapsed_cage_seen_along_a_flattened_face_is_not_entered_there():
     assert not np.any(segments.overflow)
     lengths = np.sum(np.asarray(segments.t_exit - segments.t_enter), axis=1)
     side = np.ptp(moved[:, 1])
-    assert np.all((lengths < 1e-5) | (np.abs(lengths - side) < 1e-5))
+    through = np.abs(lengths - side) < 1e-5
+    assert np.all((lengths < 1e-5) | through) and np.any(through)
 
 
 def test_a_fold_covers_the_line_once(rng):
@@ -73,7 +74,51 @@ def test_a_fold_covers_the_line_once(rng):
     y, z = rng.uniform(-0.3, 0.3, (2, 64))
     rays = (np.stack([np.full(64, -3.0), y, z], axis=1), np.broadcast_to([1.0, 0.0, 0.0], (64, 3)))
     segments = walk(folded, as_rays(rays))
+    size = np.ptp(np.asarray(mesh.vertices)[:, 0])
     for ray in range(64):
         used = np.asarray(segments.tet_ids[ray]) >= 0
         enters, exits = (np.asarray(t[ray])[used] for t in (segments.t_enter, segments.t_exit))
-        assert np.all(enters[1:] >= exits[:-1] - 1e-6)
+        assert np.all(np.abs(enters[1:] - exits[:-1]) < 1e-6)
+        assert np.sum(exits - enters) > size - 1e-5  # the box, and what sticks out of it
+
+
+@pytest.mark.parametrize("reach", [1.5, 2.2])
+def test_what_a_fold_covers_is_out_of_order_with_what_it_reaches(reach):
+    """A walk that ends on its way back has been where the next one, in another body, begins."""
+    vertices, tets = grid(np.ones((2, 2, 2), bool))
+    other, other_tets = grid(np.ones((1, 1, 1), bool))
+    both = np.concatenate([vertices - 1, 2 * other + [1.05, -1, -1]])
+    mesh = build_tet_mesh(both, np.concatenate([tets, other_tets + len(vertices)]))
+    middle = np.argmin(np.sum(np.asarray(both) ** 2, axis=1))
+    target = (np.array([reach, 0.03, 0.02]) - np.asarray(mesh.center)) / float(mesh.scale)
+    folded = mesh.replace(vertices=mesh.vertices.at[middle].set(jnp.asarray(target, jnp.float32)))
+    y, z = np.random.default_rng(0).uniform(-0.3, 0.3, (2, 256))
+    rays = (np.stack([np.full(256, -3.0), y, z], axis=1), np.broadcast_to([1.0, 0.0, 0.0], (256, 3)))
+    segments = walk(folded, as_rays(rays))
+    used = np.asarray(segments.tet_ids) >= 0
+    furthest = np.maximum.accumulate(np.where(used, segments.t_exit, -np.inf), axis=1)
+    overlap = np.any(used[:, 1:] & (segments.t_enter[:, 1:] < furthest[:, :-1] - 1e-3), axis=1)
+    assert overlap.sum() > 20
+    assert np.all(np.asarray(segments.disordered)[overlap])
+
+
+def test_a_ray_that_is_no_number_leaves_its_neighbours_alone(rng):
+    mesh = tet_mesh("cube")
+    origins, directions = GENERIC["generic"](*local_vertices(mesh), rng, 16)
+    expected = find_entries(march_tables(mesh), as_rays((origins, directions)), CONFIG)
+    directions[3] = np.nan
+    found = find_entries(march_tables(mesh), as_rays((origins, directions)), CONFIG)
+    others = np.arange(16) != 3
+    assert np.any(expected.holds[others] >= 0)
+    assert_array_equal(found.holds[others], expected.holds[others])
+
+
+def test_more_entries_than_any_buffer_are_an_error(monkeypatch):
+    monkeypatch.setattr(capacity, "MAX_GROWTH", 0)
+    mesh = tet_mesh("blobs")
+    centers = local_vertices(mesh)[0].reshape(2, -1, 3).mean(axis=1)
+    direction = (centers[1] - centers[0]) / np.linalg.norm(centers[1] - centers[0])
+    rays = as_rays((centers[:1] - 3 * direction, direction[None]))
+    world = rays.replace(origins=mesh.center + mesh.scale * rays.origins)
+    with pytest.raises(ValueError, match="enters the cage more than 1 times; raise"):
+        capacity.all_entries(mesh, march_tables(mesh), world, MarchConfig(max_entries_per_ray=1))

@@ -67,6 +67,32 @@ def test_a_frame_is_the_picture_of_its_rays(scene):
     assert 512 < covered.sum() < covered.size  # several chunks, and some background
 
 
+@pytest.mark.parametrize("devices", [1, 2, 16])
+def test_devices_share_what_does_not_fill_a_chunk(devices):
+    size, chunk = 4, 32 * devices
+    for count in (1, 7, chunk // 2, chunk):
+        slots = frames.dealt(count, chunk, devices, size)
+        assert len(np.unique(slots)) == count
+        loads = np.bincount(slots // (chunk // devices), minlength=devices)
+        assert np.ptp(loads) <= size and loads.max() <= -(-count // (devices * size)) * size
+        # as many together as are dealt at a time: rays of a tile are marched together
+        assert np.all(np.diff(slots.reshape(-1)[: count - count % size].reshape(-1, size), axis=1) == 1)
+
+
+def test_half_a_chunk_is_spread_over_both_devices(scene, monkeypatch):
+    monkeypatch.setattr(frames, "CHUNK", 1024)
+    seen, rendered = [], frames._render_sharded
+
+    def watched(impostor, tables, slabs, rays, entries, *rest):
+        seen.append(np.sum(np.asarray(entries.holds)[:, 0].reshape(2, -1) >= 0, axis=1))
+        return rendered(impostor, tables, slabs, rays, entries, *rest)
+
+    monkeypatch.setattr(frames, "_render_sharded", watched)
+    check_equal(render_frame(*scene, RENDER), whole_image(*scene, RENDER))
+    (loads,) = seen
+    assert loads.sum() < 1024 and np.ptp(loads) <= 256
+
+
 def test_frames_have_finer_steps(scene):
     """Half of them here, and samples that weigh half; fitting buffers first does not halve them again."""
     impostor, camera = scene
@@ -194,7 +220,7 @@ def test_what_cannot_be_repaired_is_an_error_and_no_picture(scene, monkeypatch):
     monkeypatch.setattr(frames, "MAX_GROWTH", 1)
     impostor, camera = scene
     config = dataclasses.replace(RENDER, march=MarchConfig(max_tets_per_ray=1, max_entries_per_ray=1))
-    with pytest.raises(RuntimeError, match="MarchConfig"):
+    with pytest.raises(RuntimeError, match="more than 2 tets or 2 entries; raise MarchConfig"):
         render_frame(impostor, camera, config)
 
 

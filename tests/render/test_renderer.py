@@ -17,8 +17,9 @@ from rays import as_rays, generic, missing
 from scenes import RENDER, constant_density, exact
 
 from nimpostor_jax.encoding.spherical_harmonics import spherical_harmonics
+from nimpostor_jax.field import impostor as field
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
-from nimpostor_jax.render.renderer import render_rays
+from nimpostor_jax.render.renderer import decode_integrated, ray_output, render_rays
 
 COUNT = 16
 render = jax.jit(render_rays, static_argnames="config")
@@ -147,6 +148,24 @@ def test_integrated_features_are_decoded_once_for_each_decoder_set(x64):
     outputs = [render(mixed, rays, exact(integrate=way)) for way in ("color", "features")]
     assert_allclose(outputs[0].color, outputs[1].color, atol=1e-12)
     assert np.std(np.asarray(outputs[0].color) / np.asarray(outputs[0].opacity)[:, None], axis=0).min() > 0.01
+
+
+@pytest.mark.parametrize("weight", [1e-3, 1e-20, 1e-37, 0.0])
+def test_next_to_no_weight_has_a_finite_slope(weight):
+    """Decoding the mean of features, and depths, divide by it; what it adds to the picture is nothing."""
+    made = scenes.impostor("cube")
+    mean = jnp.asarray(np.random.default_rng(0).normal(size=made.config.encoding.feature_dim + 2))
+    encoded = field.encode_directions(made, jnp.array([[0.6, 0.0, 0.8]]))
+
+    def seen(weight):
+        sums = (weight * mean.at[-2].set(1.0))[None]
+        output = ray_output(
+            decode_integrated(made.decoders, sums, encoded), jnp.float32(1), jnp.zeros(1, bool), None
+        )
+        return jnp.sum(output.color) + jnp.sum(output.depth)
+
+    value, slope = jax.value_and_grad(seen)(jnp.float32(weight))
+    assert np.isfinite(value) and np.isfinite(slope)
 
 
 def flatten(tree):

@@ -191,6 +191,17 @@ def test_a_step_of_its_own_is_kept_and_one_that_is_not_known_is_asked_for():
         step_boundaries(SamplerConfig())
 
 
+def test_wide_cones_stay_finite():
+    """Their later steps are longer than float32 can say; no ray is, and slots without samples neither."""
+    _, _, segments = scene()
+    config = SamplerConfig(step=0.5, cone_angle=0.2, max_samples_per_ray=256)
+    assert step_boundaries(config)[-1] > np.finfo(np.float32).max
+    samples = sample(segments, config, "barycentric")
+    assert 0 < samples.num_used < len(samples.t)
+    for leaf in jax.tree.leaves(samples):
+        assert np.all(np.isfinite(leaf))
+
+
 def test_long_rays_are_coarsened_and_say_so():
     config = SamplerConfig(measure="euclidean", step=0.5, max_samples_per_ray=4)
     samples = sample(segments_of([(0, 0.0, 2.0)], [(0, 0.0, 2.5)], []), config, "euclidean")

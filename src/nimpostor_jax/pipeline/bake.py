@@ -41,7 +41,7 @@ from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
 from nimpostor_jax.train.refine import count_lit, init_refinement, refine_step, with_tables
 from nimpostor_jax.train.sharding import device_mesh, dividing_devices, over_rays, replicated, sums_by_device
 from nimpostor_jax.train.step import RayBatch
-from nimpostor_jax.types import BakedImpostor, Embedding, HashTables, NeuralImpostor, TetMesh
+from nimpostor_jax.types import BakedImpostor, Embedding, HashTables, NeuralImpostor
 
 FIT_RAYS = 8192  # a call
 FIT_DEVICES = 4  # at most: each has moments as large as the textures
@@ -79,7 +79,7 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     layout = build_face_layout(resolutions)
     ready = for_frames(impostor)
     views = with_novel_views(scene.train, ready, config.novel_views, scene.config.render, train.seed)
-    rays = TrainingRays.of(mesh, views, render, config.fit_rays, train.seed + 2)
+    rays = TrainingRays.of(part, views, render, config.fit_rays, train.seed + 2)
     del views, ready  # the pool has what it needs
 
     def moments(num: int) -> Moments:
@@ -121,11 +121,13 @@ class TrainingRays:
     devices: Mesh
 
     @staticmethod
-    def of(mesh: TetMesh, views: PosedImages, config: RenderConfig, count: int, seed: int) -> "TrainingRays":
-        """`count` draws from the views' pixels whose rays meet the mesh."""
-        pool, _ = build_pool(mesh, views.cameras, views.images, config.march, views.backgrounds)
+    def of(
+        impostor: NeuralImpostor, views: PosedImages, config: RenderConfig, count: int, seed: int
+    ) -> "TrainingRays":
+        """`count` draws from the views' pixels whose rays meet the impostor's mesh."""
+        pool, _ = build_pool(impostor.mesh, views.cameras, views.images, config.march, views.backgrounds)
         key, size = jax.random.key(seed), min(FIT_RAYS, count)
-        sized = fit_config(mesh, pool, draw_batch(key, 0, pool, size, "white"), config)
+        sized = fit_config(impostor, pool, draw_batch(key, 0, pool, size, "white"), config)
         devices = dividing_devices(size, at_most=FIT_DEVICES)
         return TrainingRays(pool, key, count, size, sized, device_mesh(devices))
 
@@ -178,7 +180,7 @@ def visible_part(
     halvings = max(0, math.ceil(math.log2(longest / config.tet_pixels)))
     for i in range(halvings + 1):
         count = min(max(LOOK_RAYS, LOOKS_A_TET * len(impostor.mesh.tets)), config.fit_rays)
-        rays = TrainingRays.of(impostor.mesh, views, render, count, i)
+        rays = TrainingRays.of(impostor, views, render, count, i)
         seen = rays.add_up(partial(nothing_seen, impostor), add_seen, 1.0, "look", impostor)
         log_lost(int(seen.lost) / count, log)
         visible = np.asarray(seen.taken > config.min_opacity * np.maximum(seen.light, 1))
@@ -205,12 +207,16 @@ def only_tets(impostor: NeuralImpostor, keep: Bool[np.ndarray, " T"]) -> NeuralI
     return dataclasses.replace(impostor, mesh=part, embedding=within)
 
 
-def fit_config(mesh: TetMesh, pool: PixelPool, probe: RayBatch, config: RenderConfig) -> RenderConfig:
+def fit_config(
+    impostor: NeuralImpostor, pool: PixelPool, probe: RayBatch, config: RenderConfig
+) -> RenderConfig:
     """With steps for small tets, and buffers for them."""
+    mesh = impostor.mesh
     march = dataclasses.replace(config.march, max_entries_per_ray=pool.entries.slots)
     config = dataclasses.replace(config, march=march, frame_refinement=FIT_REFINEMENT)
     config = dataclasses.replace(refined(config), min_weight=max(config.min_weight, 1e-4) / FIT_REFINEMENT)
-    return fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, config)
+    tables = jax.jit(march_tables)(mesh)
+    return fit_capacities(mesh, tables, probe.rays, config, embedding=impostor.embedding)
 
 
 def checked_texels(
@@ -264,6 +270,11 @@ def refine(
         if i % SYNC_EVERY == 0:
             jax.block_until_ready(loss_and_lost)
     losses, lost = np.array(found).T
+    if not np.isfinite(losses).all():
+        raise FloatingPointError(
+            f"the loss is {losses[~np.isfinite(losses)][0]} in step {np.argmax(~np.isfinite(losses))} of "
+            "refinement; lower BakeConfig.learning_rate"
+        )
     first, last = losses[:20].mean(), losses[-20:].mean()
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
     log_lost(lost.mean(), log)

@@ -20,7 +20,7 @@ from nimpostor_jax.render.sampling import plan_samples, segment_measure, step_bo
 from nimpostor_jax.render.segments import in_cells, locate_segments, march_segments
 from nimpostor_jax.render.selection import present_samples, slabs_of, visible_samples
 from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
-from nimpostor_jax.types import NeuralImpostor, Rays, TetMesh
+from nimpostor_jax.types import Embedding, NeuralImpostor, Rays, TetMesh
 
 # A chunk of a frame is 32 image tiles from all over it, whose mean varies by a tenth. Room that is not used
 # costs next to nothing; rays that do not fit cost a second program.
@@ -39,7 +39,10 @@ def ray_entries(mesh: TetMesh, tables: MarchTables, rays: Rays, config: MarchCon
 def all_entries(
     mesh: TetMesh, tables: MarchTables, rays: Rays, config: MarchConfig
 ) -> tuple[Entries, MarchConfig]:
-    """`ray_entries` in as many slots as any of these rays needs, and the config with that number."""
+    """`ray_entries` in as many slots as any of these rays needs, and the config with that number.
+
+    Raises ValueError where a ray needs more than 2**6 times the config's slots.
+    """
     slots = config.max_entries_per_ray
     for _ in range(MAX_GROWTH + 1):
         config = dataclasses.replace(config, max_entries_per_ray=slots)
@@ -47,6 +50,11 @@ def all_entries(
         if not np.any(entries.overflow):
             break
         slots *= 2
+    else:
+        raise ValueError(
+            f"a ray enters the cage more than {config.max_entries_per_ray} times; "
+            "raise MarchConfig.max_entries_per_ray"
+        )
     most = max(1, int(np.sum(np.asarray(entries.holds) >= 0, axis=1).max(initial=0)))
     entries = dataclasses.replace(entries, holds=entries.holds[:, :most])
     return entries, dataclasses.replace(config, max_entries_per_ray=most)
@@ -62,18 +70,23 @@ class _Demand(NamedTuple):
 
 @partial(jax.jit, static_argnames="config")
 def _demand(
-    mesh: TetMesh, tables: MarchTables, rays: Rays, config: RenderConfig, field: NeuralImpostor | None
+    mesh: TetMesh,
+    tables: MarchTables,
+    rays: Rays,
+    config: RenderConfig,
+    field: NeuralImpostor | None,
+    embedding: Embedding | None,
 ) -> _Demand:
     local = to_local(mesh, rays)
     crossings = traverse(tables, local, config.march)
-    segments = locate_segments(mesh, local, crossings, config.near / mesh.scale)
+    segments = in_cells(locate_segments(mesh, local, crossings, config.near / mesh.scale), embedding)
     measure = segment_measure(segments, config.sampler.measure)
     total = jax.ops.segment_sum(measure, segments.rays, rays.origins.shape[0])
     planned, occupied = None, None
     if field is not None:
         sampler = dataclasses.replace(config.sampler, capacity_per_ray=None, occupied_per_ray=None)
-        in_field, slabs = in_cells(segments, field.embedding), slabs_of(field, config)
-        plan = plan_samples(in_field, sampler, config.density_measure, slabs=slabs)
+        slabs = slabs_of(field, config)
+        plan = plan_samples(segments, sampler, config.density_measure, slabs=slabs)
         planned = plan.num_used
         _, _, occupied = present_samples(field, plan, dataclasses.replace(config, sampler=sampler))
     return _Demand(
@@ -105,9 +118,12 @@ def fit_capacities(
     config: RenderConfig,
     *,
     field: NeuralImpostor | None = None,
+    embedding: Embedding | None = None,
     margin: float = 1.25,
 ) -> RenderConfig:
     """A config whose buffers hold these sample rays (drawn like those to come), with a margin.
+
+    Steps are measured in the cells of the `embedding`, where tets lie in those (by default in the field's).
 
     `margin` is that of a single ray's slots; buffers that rays share have `SHARED_MARGIN`. Slots are rounded
     up to multiples of 8; `max_samples_per_ray` of the given config stays the limit. With a `field`, for
@@ -116,14 +132,15 @@ def fit_capacities(
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
     of_frames = field is not None
+    embedding = field.embedding if field is not None and embedding is None else embedding
     if field is not None and (field.occupied is None or not config.skip_empty) and not field.gates:
         field = None  # all samples are present
-    demand = _demand(mesh, tables, rays, config, field)
+    demand = _demand(mesh, tables, rays, config, field, embedding)
     for _ in range(MAX_GROWTH):
         if not demand.overflow:
             break
         config = grow_march(config)
-        demand = _demand(mesh, tables, rays, config, field)
+        demand = _demand(mesh, tables, rays, config, field, embedding)
     if demand.overflow:
         raise ValueError(
             f"a ray crosses more than {config.march.max_tets_per_ray} tets or enters the cage more than "

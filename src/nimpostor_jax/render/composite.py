@@ -126,8 +126,8 @@ def _sum_by_ray(num_rays: int, weights: Array, values: Array, rays: Array, num_u
 
     def add(start: Array, sums: Array) -> Array:
         weight, value, ray = take(items, start, chunk)
-        weight = jnp.where(start + jnp.arange(chunk) < num_used, weight, 0)
-        return sums.at[ray].add(weight[:, None] * value)
+        used = start + jnp.arange(chunk) < num_used
+        return sums.at[ray].add(jnp.where(used[:, None], weight[:, None] * value, 0))
 
     return for_chunks(num_used, chunk, add, jnp.zeros((num_rays, values.shape[1]), values.dtype))
 

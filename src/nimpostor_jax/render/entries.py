@@ -205,8 +205,9 @@ def _near_clusters(tables: MarchTables, origin: tuple, direction: tuple) -> Bool
     squared = sum((o - height * a) ** 2 for o, a in zip(offset, axis, strict=True))
     margin = 1e-4 * (jnp.abs(height) + tables.cluster_radii)  # rounding of cosine and height, generously
     reach = tables.cluster_radii + rho
-    near = jnp.sqrt(squared) <= margin + reach + (jnp.abs(height) + reach) * (tangent + 1e-3)
-    return (near | (cosine < 0.1)) & (tables.cluster_radii >= 0)
+    far = jnp.sqrt(squared) > margin + reach + (jnp.abs(height) + reach) * (tangent + 1e-3)
+    # One ray that is not finite makes all of this NaN, which is not far.
+    return (~far | (cosine < 0.1)) & (tables.cluster_radii >= 0)
 
 
 def _pack_bits(flags: Bool[Array, " n"]) -> Array:

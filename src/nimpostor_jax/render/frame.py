@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.field.impostor import merge_levels
@@ -206,30 +206,33 @@ class View:
             outputs = [self._render_chunk(pixels[part], chunk, config, refinement, first) for part in parts]
             overflowed = [pending[:0]]
             for part, output in zip(parts, outputs, strict=True):
+                slots = dealt(len(part), chunk, self._num_devices, TILE * TILE)
                 for name, target in results.items():
-                    target[part] = np.asarray(getattr(output, name))[: len(part)]
-                overflowed.append(part[np.asarray(output.overflow)[: len(part)]])
+                    target[part] = np.asarray(getattr(output, name))[slots]
+                overflowed.append(part[np.asarray(output.overflow)[slots]])
             pending = np.concatenate(overflowed)
             if not pending.size:
                 return results
-            config, chunk, first = _grow(config), REPAIR_CHUNK * self._num_devices, False
+            tried, config = config, _grow(config)
+            chunk, first = REPAIR_CHUNK * self._num_devices, False
         raise RuntimeError(
-            f"{pending.size} rays need more than {config.march.max_tets_per_ray} tets or "
-            f"{config.march.max_entries_per_ray} entries; raise MarchConfig's sizes"
+            f"{pending.size} rays need more than {tried.march.max_tets_per_ray} tets or "
+            f"{tried.march.max_entries_per_ray} entries; raise MarchConfig's sizes"
         )
 
     def _render_chunk(
         self, pixels: np.ndarray, chunk: int, config: RenderConfig, refinement: int, known_entries: bool
     ) -> RenderOutput:
         """Start rendering a chunk; rays that fill it up enter nothing and cost nothing."""
-        padded = np.concatenate([pixels, np.full(chunk - len(pixels), pixels[-1])])
+        slots = dealt(len(pixels), chunk, self._num_devices, TILE * TILE)
+        padded, used = np.full(chunk, pixels[-1]), np.zeros(chunk, bool)
+        padded[slots], used[slots] = pixels, True
         rays = jax.tree.map(lambda x: x[padded], self._rays)
         if known_entries:
             entries = jax.tree.map(lambda x: x[padded], self._entries)
         else:
             entries = ray_entries(self._impostor.mesh, self._tables, rays, config.march)
             entries = jax.tree.map(np.asarray, entries)
-        used = np.arange(chunk) < len(pixels)
         entries = dataclasses.replace(
             entries,
             holds=np.where(used[:, None], entries.holds, -1),
@@ -239,6 +242,15 @@ class View:
         refinements = np.full(chunk, refinement, rays.origins.dtype)
         placed = jax.device_put((rays, entries, refinements), self._by_ray)
         return _render_sharded(*self._replicas, *placed, config)
+
+
+def dealt(count: int, chunk: int, num_devices: int, size: int) -> Int[np.ndarray, " count"]:
+    """Slots of a chunk for `count` items, dealt `size` at a time to devices that have equal blocks of it.
+
+    Where items do not fill a chunk, all devices have about as many, and room for as many more.
+    """
+    blocks = np.arange(chunk).reshape(num_devices, -1, size)
+    return blocks.transpose(1, 0, 2).reshape(-1)[:count]
 
 
 def empty_outputs(count: int, dtype: np.dtype) -> dict[str, np.ndarray]:

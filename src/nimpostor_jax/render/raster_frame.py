@@ -14,7 +14,7 @@ from nimpostor_jax.geometry.tetrahedron import corners, signed_volumes
 from nimpostor_jax.render.baked import shade_segments
 from nimpostor_jax.render.camera import TILE, to_local
 from nimpostor_jax.render.capacity import MAX_GROWTH, grow_march
-from nimpostor_jax.render.frame import Frame, device_mesh, empty_outputs
+from nimpostor_jax.render.frame import Frame, dealt, device_mesh, empty_outputs
 from nimpostor_jax.render.rasterize import (
     Screen,
     TileLists,
@@ -76,21 +76,24 @@ def rasterize_frame(baked: BakedImpostor, camera: Camera, config: RenderConfig) 
     replicas = jax.device_put((baked, camera, screen, lists), NamedSharding(mesh, P()))
     for _ in range(MAX_GROWTH + 1):
         parts = [pending[i : i + chunk] for i in range(0, len(pending), chunk)]
-        placed = [np.concatenate([part, np.full(chunk - len(part), -1)]).astype(np.int32) for part in parts]
-        placed = [jax.device_put(tiles, NamedSharding(mesh, P("rays"))) for tiles in placed]
-        outputs = [_render_tiles(*replicas, tiles, config, tets_per_tile) for tiles in placed]
+        outputs, slots = [], [dealt(len(part), chunk, mesh.size, 1) for part in parts]
+        for part, places in zip(parts, slots, strict=True):
+            tiles = np.full(chunk, -1, np.int32)
+            tiles[places] = part
+            placed = jax.device_put(tiles, NamedSharding(mesh, P("rays")))
+            outputs.append(_render_tiles(*replicas, placed, config, tets_per_tile))
         again = [pending[:0]]
-        for part, output in zip(parts, outputs, strict=True):
+        for part, places, output in zip(parts, slots, outputs, strict=True):
             for name, target in results.items():
                 value = np.asarray(getattr(output, name))
-                target[part] = value.reshape(chunk, TILE * TILE, *value.shape[1:])[: len(part)]
-            again.append(part[np.asarray(output.overflow).reshape(chunk, -1)[: len(part)].any(axis=1)])
+                target[part] = value.reshape(chunk, TILE * TILE, *value.shape[1:])[places]
+            again.append(part[np.asarray(output.overflow).reshape(chunk, -1)[places].any(axis=1)])
         pending = np.concatenate(again)
         if not pending.size:
             return Frame(**{name: _image(x, camera) for name, x in results.items()})
-        config = grow_march(config)
+        tried, config = config, grow_march(config)
     raise RuntimeError(
-        f"pixels in {pending.size} tiles see more than {config.march.max_tets_per_ray} tets; "
+        f"pixels in {pending.size} tiles see more than {tried.march.max_tets_per_ray} tets; "
         "raise MarchConfig.max_tets_per_ray"
     )
 

@@ -158,7 +158,7 @@ def ray_output(
 ) -> RenderOutput:
     """What rays see, from their sums by weight of colour, 1, and t, which `scale` takes to world units."""
     opacity, depth = sums[:, 3], sums[:, 4]
-    visible = opacity > 0
+    visible = _divides(opacity)
     return RenderOutput(
         color=sums[:, :3],
         opacity=opacity,
@@ -177,13 +177,18 @@ def decode_integrated(
     sets see adds up.
     """
     weights = sums[:, -2]
-    visible = weights > 0
+    visible = _divides(weights)
     mean = jnp.where(visible, 1 / jnp.where(visible, weights, 1), 0)[:, None] * sums[:, :-2]
     num_sets, count = num_decoder_sets(decoders), directions.shape[0]
     sets = jnp.arange(count, dtype=jnp.int32) // max(count // num_sets, 1)
     colors = map_used(_decode_mean, decoders, (mean, directions, sets), jnp.int32(count))
     values = jnp.column_stack([weights[:, None] * colors, sums[:, -2:]])
     return jnp.sum(values.reshape(num_sets, count // num_sets, 5), axis=0)
+
+
+def _divides(weights: Float[Array, " N"]) -> Bool[Array, " N"]:
+    """Where sums may be divided by their weight: the slope is 1 / weight^2, which overflows for less."""
+    return weights > jnp.finfo(weights.dtype).tiny ** 0.25  # 3e-10 in float32
 
 
 def _decode_mean(decoders: Parameters, part: tuple) -> Float[Array, "chunk 3"]:

@@ -8,6 +8,7 @@ Axes: N packed segments, R rays, S samples a ray at most, M packed samples.
 """
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
@@ -128,7 +129,9 @@ def plan_samples(
     extents = segment_measure(segments, config.measure)
     starts = sum_before(extents, owners)
     total = jax.ops.segment_sum(extents, owners, num_rays, indices_are_sorted=True)
-    boundaries = jnp.asarray(step_boundaries(config), extents.dtype)
+    # Cones open exponentially: steps that no ray is long enough for must stay finite, too.
+    most = math.sqrt(jnp.finfo(extents.dtype).max)
+    boundaries = jnp.asarray(np.minimum(step_boundaries(config), most), extents.dtype)
     # The tolerance keeps a ray of exactly n steps from getting n + 1 by rounding.
     asked = jax.lax.stop_gradient(total if refinement is None else total * refinement)
     fits = jnp.searchsorted(boundaries, asked * (1 - 1e-5)).astype(jnp.int32)

@@ -56,7 +56,8 @@ def locate_segments(
     geometry = (mesh.vertices, rays.origins, rays.directions)
     t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, owners, codes, packed.ends)
     rounding = ROUNDING * jnp.finfo(t_exit.dtype).eps * (1 + jnp.abs(t_enter))
-    behind = jnp.maximum(_covered(owners, codes >= 0, t_enter, t_exit, rounding), near)
+    covered = _covered(owners, codes >= 0, t_enter, t_exit, rounding)
+    behind = jnp.maximum(covered, near)
     used = (codes >= 0) & (t_exit > jnp.maximum(t_enter, behind))
     cut = used & (t_enter < behind)  # a division only where it counts: lengths may be next to 0
     skipped = jnp.where(cut, behind - t_enter, 0) / jnp.where(cut, t_exit - t_enter, 1)
@@ -69,14 +70,17 @@ def locate_segments(
         lambda_enter=jnp.where(used[:, None], lambda_enter + skipped * (lambda_exit - lambda_enter), 0),
         lambda_exit=jnp.where(used[:, None], lambda_exit, 0),
         overflow=packed.overflow,
-        disordered=_disordered(packed, t_enter, t_exit, rounding),
+        disordered=_disordered(packed, jnp.maximum(t_enter, covered), jnp.maximum(t_exit, covered), rounding),
     )
 
 
 def _disordered(
     packed: "_Packed", t_enter: Float[Array, " N"], t_exit: Float[Array, " N"], rounding: Float[Array, " N"]
 ) -> Bool[Array, " R"]:
-    """Walks come in the order of their entries, each without gaps: overlap shows between neighbours."""
+    """Walks come in the order of their entries, each without gaps: overlap shows between neighbours.
+
+    Exits are the furthest that walks have been: one that ends on its way back has covered what lies beyond.
+    """
     rays, ordered = packed.rays, jnp.zeros_like(packed.overflow)
     back = (packed.codes[1:] >= 0) & (rays[1:] == rays[:-1]) & (t_enter[1:] < t_exit[:-1] - rounding[1:])
     return jax.lax.cond(jnp.any(back), lambda: ordered.at[rays[1:]].max(back), lambda: ordered)
