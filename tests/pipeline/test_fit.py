@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 
 from nimpostor_jax.gin_flags import load_config
+from nimpostor_jax.io.checkpoint import latest_step
 from nimpostor_jax.io.images import composite
 from nimpostor_jax.io.mesh_files import save_tets
 from nimpostor_jax.metrics import psnr
+from nimpostor_jax.pipeline import fit as fit_module
 from nimpostor_jax.pipeline.curve import HeldOutCurve
-from nimpostor_jax.pipeline.evaluate import evaluate, orbit, picture_name, vertical
+from nimpostor_jax.pipeline.evaluate import MAX_PSNR, evaluate, orbit, picture_name, vertical
 from nimpostor_jax.pipeline.fit import Progress, fit
 from nimpostor_jax.pipeline.prepare import prepare
 from nimpostor_jax.render.frame import _render_sharded
@@ -27,6 +29,13 @@ class Killed(Exception):
 @pytest.fixture(scope="module")
 def scene(config, cage):
     return prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
+
+
+def cleared(impostor):
+    """One that shows nothing."""
+    decoders = jax.tree.map(np.zeros_like, impostor.decoders)
+    decoders["density"][-1]["bias"] = decoders["density"][-1]["bias"] - 40.0  # exp(-40)
+    return dataclasses.replace(impostor, decoders=decoders)
 
 
 def arrays(impostor):
@@ -51,6 +60,65 @@ def test_killed_and_resumed_run_equals_one_that_was_not(bindings, cage, tmp_path
         np.testing.assert_array_equal(a, b)
     with (tmp_path / "b" / "log.csv").open() as file:
         assert [int(row["step"]) for row in csv.DictReader(file)] == [1, 2, 4, 6]
+
+
+def no_number_from(step, monkeypatch):
+    """Training whose parameters are no numbers from a step on."""
+    train_step = fit_module.train_step
+
+    def broken(state, *rest, **options):
+        state, metrics = train_step(state, *rest, **options)
+        bad = jax.tree.map(lambda x: jnp.where(state.step >= step, jnp.nan, x), state.parameters)
+        return dataclasses.replace(state, parameters=bad), metrics
+
+    monkeypatch.setattr(fit_module, "train_step", broken)
+
+
+def test_what_is_no_number_is_not_saved(bindings, cage, tmp_path, monkeypatch):
+    bindings = [*bindings, "TrainConfig.log_every=50", "TrainConfig.checkpoint_every=2"]
+    scene = prepare(load_config(bindings=bindings), "fluffy_ball", cage=cage, log=lambda _: None)
+    no_number_from(4, monkeypatch)
+    with pytest.raises(FloatingPointError, match="after step 4; lower"):
+        fit(scene, workdir=tmp_path, log=lambda _: None)
+    assert latest_step(tmp_path / "checkpoints") == 2
+
+
+def test_what_is_no_number_is_not_returned(scene, monkeypatch):
+    no_number_from(6, monkeypatch)
+    with pytest.raises(FloatingPointError, match="after step 6"):
+        fit(scene, log=lambda _: None)
+
+
+def test_buffers_grow_until_all_rays_are_trained_on(bindings, cage, tmp_path):
+    """At the same steps in a run that was cut off."""
+    config = load_config(bindings=[*bindings, "TrainConfig.warmup_steps=1", "TrainConfig.eval_every=5"])
+    scene = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
+    march = dataclasses.replace(scene.render.march, max_tets_per_ray=2, capacity_per_ray=None)
+    scene = dataclasses.replace(scene, render=dataclasses.replace(scene.render, march=march))
+    messages = []
+    through, progress = fit(scene, log=messages.append)
+    assert progress.growths > 0
+    assert any("of the rays overflowed; larger buffers" in message for message in messages)
+
+    def die(impostor, step):
+        raise Killed
+
+    with pytest.raises(Killed):
+        fit(scene, workdir=tmp_path, callback=die, log=lambda _: None)
+    resumed, again = fit(scene, workdir=tmp_path, log=lambda _: None)
+    assert again.growths == progress.growths
+    for a, b in zip(arrays(through), arrays(resumed), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_log_keeps_its_lines_when_a_run_goes_on(tmp_path):
+    """Before anything else happens, and without a line that was cut off."""
+    path = tmp_path / "log.csv"
+    header, rows = ",".join(fit_module.LOG_FIELDS), [f"{i},1,2,3,4,5,6,7" for i in (1, 2, 4, 6)]
+    path.write_text("\n".join([header, *rows, "1"]))
+    log = fit_module._LogFile(path, 4)
+    assert path.read_text().split() == [header, *rows[:3]]
+    log.close()
 
 
 def test_a_callback_may_keep_what_it_gets(bindings, cage):
@@ -94,6 +162,24 @@ def test_a_curve_is_that_of_evaluation_and_compiles_once(scene, tmp_path):
     white = np.mean([psnr(np.ones_like(truth), truth) for truth in truths])
     assert nothing == pytest.approx(white, abs=1e-6)
     assert lines[0] == f"step 4: PSNR {untrained:.2f} dB on 4 held-out views"
+
+
+def test_equal_pictures_have_a_finite_psnr(scene, tmp_path):
+    """Nothing, in front of white: of such a view infinity would go into the mean, and into JSON."""
+    views = scene.test.select([0, 1])
+    images = views.images.copy()
+    images[0] = 0
+    clear = cleared(scene.impostor)
+    views = dataclasses.replace(views, images=images)
+    result = evaluate(clear, views, scene.config.render, log=lambda _: None)
+    assert result["per_view"][0]["psnr"] == MAX_PSNR
+    assert MAX_PSNR / 2 < result["psnr"] < MAX_PSNR
+
+
+def test_a_damaged_curve_is_named(scene, tmp_path):
+    (tmp_path / "curve.json").write_text("[[2,")
+    with pytest.raises(ValueError, match=r"curve\.json is damaged .*remove it"):
+        HeldOutCurve(scene, tmp_path / "curve.json")
 
 
 def test_evaluation_writes_pictures(scene, tmp_path):
@@ -150,9 +236,7 @@ def test_views_are_compared_over_their_own_backgrounds(scene):
     behind = np.random.default_rng(0).uniform(size=views.images[..., :3].shape).astype(np.float32)
     opaque = np.concatenate([behind, np.ones_like(behind[..., :1])], axis=-1)
     opaque[0, :5, :, :3] = 1 - behind[0, :5]
-    decoders = jax.tree.map(np.zeros_like, scene.impostor.decoders)
-    decoders["density"][-1]["bias"] = decoders["density"][-1]["bias"] - 40.0  # exp(-40): clear
-    clear = dataclasses.replace(scene.impostor, decoders=decoders)
+    clear = cleared(scene.impostor)
     views = dataclasses.replace(views, images=opaque, backgrounds=behind)
     found = evaluate(clear, views, scene.config.render, log=lambda _: None)["psnr"]
     wrong = np.mean(np.square(opaque[..., :3] - behind))

@@ -233,7 +233,12 @@ def test_overflowed_rays_are_ignored_and_reported():
     lost = np.asarray(march(march_tables(impostor.mesh), local, config.march).overflow)
     assert 0 < lost.sum() < COUNT
     gradient = jax.jit(loss_gradient, static_argnames="config")
-    other = dataclasses.replace(batch, target=jnp.where(lost[:, None], 7.0, batch.target))
+    batch = dataclasses.replace(batch, opacity_cost=jnp.zeros(COUNT))
+    other = dataclasses.replace(
+        batch,
+        target=jnp.where(lost[:, None], 7.0, batch.target),
+        opacity_cost=jnp.where(lost, 5.0, batch.opacity_cost),
+    )
     slope, metrics = gradient(trainable(impostor), impostor, batch, config=config)
     other_slope, other_metrics = gradient(trainable(impostor), impostor, other, config=config)
     assert_allclose(metrics["overflow"], lost.mean())

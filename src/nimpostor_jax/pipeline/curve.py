@@ -8,7 +8,7 @@ import numpy as np
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.io.images import composite
 from nimpostor_jax.metrics import psnr
-from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, write_json
+from nimpostor_jax.pipeline.evaluate import MAX_PSNR, camera_of, composite_frame, write_json
 from nimpostor_jax.pipeline.prepare import Log, Scene
 from nimpostor_jax.render.frame import frame_config, render_frame
 from nimpostor_jax.types import NeuralImpostor
@@ -28,7 +28,10 @@ class HeldOutCurve:
         self._views = scene.test.select(np.linspace(0, len(scene.test) - 1, count).astype(int))
         self._scene, self._file, self._log = scene, file, log
         self._config: RenderConfig | None = None
-        saved = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
+        try:
+            saved = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
+        except ValueError as error:
+            raise ValueError(f"{file} is damaged ({error}); remove it") from error
         every = max(1, scene.config.train.eval_every)  # other steps are those of a run with other settings
         self.points: list[tuple[int, float]] = [(step, value) for step, value in saved if step % every == 0]
 
@@ -43,7 +46,7 @@ class HeldOutCurve:
         for i in range(len(views)):
             behind = views.background(i, config.data.background)
             image = composite_frame(render_frame(impostor, camera_of(views, i), self._config), behind)
-            values.append(psnr(image, composite(views.images[i], behind)))
+            values.append(min(psnr(image, composite(views.images[i], behind)), MAX_PSNR))
         mean = float(np.mean(values))
         self.points = [point for point in self.points if point[0] < step] + [(step, mean)]
         write_json(self._file, self.points)

@@ -22,6 +22,8 @@ from nimpostor_jax.types import BakedImpostor, Camera, NeuralImpostor
 
 Log = Callable[[str], None]
 
+MAX_PSNR = 100.0  # of equal pictures: infinity is no JSON, and no part of a mean
+
 
 def camera_of(views: PosedImages, index: int) -> Camera:
     """One camera of a set."""
@@ -39,9 +41,9 @@ def evaluate(
 ) -> dict[str, Any]:
     """PSNR, SSIM and LPIPS (None without the extra `lpips`) on views, mean and per view; seconds a frame.
 
-    Truth and render stand over the view's own background where it has one, else over `background`. With
-    `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The time is the median
-    over the views of a whole frame, with everything but compilation.
+    PSNR is `MAX_PSNR` at most. Truth and render stand over the view's own background where it has one, else
+    over `background`. With `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The
+    time is the median over the views of a whole frame, with everything but compilation.
     """
     per_view: list[dict[str, Any]] = []
     seconds = []
@@ -58,7 +60,7 @@ def evaluate(
         per_view.append(
             {
                 "view": name,
-                "psnr": metrics.psnr(image, truth),
+                "psnr": min(metrics.psnr(image, truth), MAX_PSNR),
                 "ssim": metrics.ssim(image, truth),
                 "lpips": metrics.lpips(image, truth) if min(image.shape[:2]) >= LPIPS_MIN_SIDE else None,
             }

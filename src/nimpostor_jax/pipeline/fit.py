@@ -18,6 +18,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from nimpostor_jax.config import RenderConfig, TrainConfig
+from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.checkpoint import (
     cage_fingerprint,
     latest_step,
@@ -52,7 +53,9 @@ LOG_FIELDS = (
     "overflow",
     "coarsened",
 )
-MAX_OVERFLOW = 0.5  # share of a batch's rays that may be dropped before the buffers grow
+# Share of a batch's rays that may be left out before the buffers grow: the longest are so in every step, and
+# what only they see would not be trained.
+MAX_OVERFLOW = 1e-3
 
 
 @dataclasses.dataclass
@@ -82,7 +85,8 @@ def fit(
 
     With a `workdir`, writes `log.csv` and checkpoints there and resumes from them. `max_minutes` replaces
     `TrainConfig.steps`: the schedule then follows the clock. `callback(impostor, step)` runs every
-    `TrainConfig.eval_every` steps. Raises FloatingPointError where the loss is not finite.
+    `TrainConfig.eval_every` steps. Raises FloatingPointError where the loss or a parameter is not finite,
+    before that is saved or returned.
     """
     config = scene.config.train
     devices = dividing_devices(config.rays_per_batch)
@@ -122,6 +126,7 @@ def fit(
     )
 
     def save() -> None:
+        _check_finite(state, progress.step)
         if checkpoints is not None and latest_step(checkpoints) != progress.step:
             metadata = {**identity, "seconds": progress.seconds, "growths": progress.growths}
             save_checkpoint(checkpoints, progress.step, state, scene.config, metadata=metadata)
@@ -137,7 +142,8 @@ def fit(
             state, metrics = compiled(state, impostor, batch, jnp.asarray(rate, jnp.float32), config=render)
             progress.step += 1
             bar.update()
-            logged = progress.step % config.log_every == 0 or clock is None
+            regular = progress.step % config.log_every == 0
+            logged = regular or clock is None
             stops = (_SYNC_EVERY, config.checkpoint_every, config.eval_every or _SYNC_EVERY)
             if logged or any(progress.step % every == 0 for every in stops):
                 jax.block_until_ready(metrics)  # before the clock is read, which what follows stops
@@ -146,19 +152,20 @@ def fit(
             if logged:
                 record = records.write(progress, metrics, rate, config.rays_per_batch)
                 bar.set_postfix({k: f"{record[k]:.4g}" for k in ("loss", "psnr", "rays_per_second")})
-                if record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps:
-                    render = _grow(render)
-                    progress.growths += 1
-                    share = f"{record['overflow']:.0%}"
-                    log(f"step {progress.step}: {share} of the rays overflowed; larger buffers")
             clock = time.perf_counter()
+            # At steps that do not depend on where a process began
+            if regular and record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps:
+                render = _grow(render)
+                progress.growths += 1
+                clock = None  # the next step compiles
+                log(f"step {progress.step}: {record['overflow']:.1%} of the rays overflowed; larger buffers")
             if progress.step % config.checkpoint_every == 0:
                 save()
-                clock = time.perf_counter()
+                clock = clock and time.perf_counter()
             if callback is not None and config.eval_every and progress.step % config.eval_every == 0:
                 # A copy, which the callback may keep: the next step consumes the state.
                 callback(jax.tree.map(jnp.copy, _trained(scene, state, devices)), progress.step)
-                clock = time.perf_counter()
+                clock = clock and time.perf_counter()
         save()
     finally:
         bar.close()
@@ -168,6 +175,19 @@ def fit(
 
 _SYNC_EVERY = 8  # steps that may be under way at once
 _OCCUPANCY_EVERY = 16  # steps, as in Instant-NGP
+
+
+def _check_finite(state: TrainState, step: int) -> None:
+    if not _is_finite(state.parameters):
+        raise FloatingPointError(
+            f"parameters are not finite after step {step}; lower TrainConfig.learning_rate, and remove the "
+            "folder or go on from its last checkpoint, which is from before"
+        )
+
+
+@jax.jit
+def _is_finite(tree: dict) -> jax.Array:
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
 
 
 def _trained(scene: Scene, state: TrainState, devices: Sequence[jax.Device]) -> NeuralImpostor:
@@ -195,15 +215,17 @@ class _LogFile:
         self._last = (step, time.perf_counter())
         if path is None:
             return
-        path.parent.mkdir(parents=True, exist_ok=True)
         kept = []
         if path.exists() and step > 0:
-            with path.open(newline="") as file:
-                kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
-        self._file = path.open("w", newline="")
+            with path.open(newline="") as file:  # a killed process may have left part of a line
+                whole = [row for row in csv.DictReader(file) if None not in row.values()]
+            kept = [row for row in whole if int(row["step"]) <= step]
+        with atomic_path(path) as partial, partial.open("w", newline="") as file:
+            writer = csv.DictWriter(file, LOG_FIELDS)
+            writer.writeheader()
+            writer.writerows(kept)
+        self._file = path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, LOG_FIELDS)
-        self._writer.writeheader()
-        self._writer.writerows(kept)
 
     def write(self, progress: Progress, metrics: dict, rate: float, rays: int) -> dict[str, float]:
         """Record a step; waits for its metrics."""

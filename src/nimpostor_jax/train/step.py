@@ -134,7 +134,7 @@ def render_loss(
         seen = cells_of(samples.tet_ids, samples.lambdas, used, *impostor.occupied.shape)
         metrics["seen_cells"] = seen.astype(loss.dtype)  # a mean over devices is as good as "any"
     if batch.opacity_cost is not None:
-        loss += jnp.mean(batch.opacity_cost * output.opacity)
+        loss += jnp.mean(jnp.where(output.overflow, 0, batch.opacity_cost * output.opacity))
     return loss, metrics
 
 
