@@ -78,6 +78,8 @@ EXPERIMENTS = st.builds(
         (SamplerConfig, "step", 0.0),
         (SamplerConfig, "step", float("inf")),
         (SamplerConfig, "step", float("nan")),
+        (EncodingConfig, "log2_table_size", -1),
+        (EncodingConfig, "log2_table_size", 27),
         (SamplerConfig, "cone_angle", -0.1),
         (SamplerConfig, "max_samples_per_ray", 0),
         (SamplerConfig, "capacity_per_ray", 0),

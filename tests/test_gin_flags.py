@@ -191,6 +191,9 @@ def test_a_bad_line_of_an_included_file_is_named_by_its_place(tmp_path):
 def test_a_file_that_includes_itself(tmp_path):
     path = write(tmp_path / "a.gin", "include 'a.gin'")
     assert "includes itself" in message_of([path])
+    (tmp_path / "sub").mkdir()
+    write(tmp_path / "sub" / "c.gin", "include '../b.gin'")  # its path is spelled longer each time
+    assert "includes itself" in message_of([write(tmp_path / "b.gin", "include 'sub/c.gin'")])
 
 
 def test_a_missing_file_suggests_its_neighbour(tmp_path):
@@ -297,13 +300,14 @@ def test_run_cli_passes_arguments_and_status(capsys):
     assert outcome(lambda argv: 3, [], capsys) == (3, "")
 
 
-@pytest.mark.parametrize("kind", [ValueError, FileNotFoundError, PermissionError])
+@pytest.mark.parametrize("kind", [ValueError, FileNotFoundError, PermissionError, FloatingPointError])
 def test_run_cli_ends_a_users_error_in_one_line(kind, capsys):
     assert outcome(failing(kind("bad\n  file x")), [], capsys) == (2, "error: bad file x\n")
 
 
-def test_run_cli_says_how_to_see_where_a_type_error_comes_from(capsys):
-    status, err = outcome(failing(TypeError("bad")), [], capsys)
+@pytest.mark.parametrize("kind", [TypeError, RuntimeError])
+def test_run_cli_says_how_to_see_where_other_errors_come_from(kind, capsys):
+    status, err = outcome(failing(kind("bad")), [], capsys)
     assert (status, err.count("\n")) == (2, 1)
     assert err.startswith("error: bad") and "--traceback" in err
 

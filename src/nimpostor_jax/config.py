@@ -47,12 +47,8 @@ class EncodingConfig:
     init_scale: float = 1e-2
 
     def __post_init__(self) -> None:
-        _require(
-            self.layout in typing.get_args(Layout),
-            self,
-            "layout",
-            f"one of {typing.get_args(Layout)}",
-        )
+        layouts = typing.get_args(Layout)
+        _require(self.layout in layouts, self, "layout", f"one of {layouts}")
         _require(
             self.interpolation in typing.get_args(Interpolation),
             self,
@@ -69,6 +65,7 @@ class EncodingConfig:
             "num_levels",
             "such that the finest resolution is <= 4096",
         )
+        _require(1 <= self.log2_table_size <= 26, self, "log2_table_size", "in [1, 26]")
         _require(
             1 <= self.min_log2_tet_table <= self.max_log2_tet_table <= 20,
             self,

@@ -158,8 +158,9 @@ def run_cli(
 ) -> NoReturn:
     """Run a script's `main(argv)` and exit with its status; what a user can cause ends in one line.
 
-    ValueError, TypeError and OSError (a missing file) print `error: ...` on stderr and exit with 2,
-    Ctrl-C exits with 130. `--traceback` or NIMPOSTOR_TRACEBACK=1 lets the error through instead.
+    ValueError, TypeError, OSError (a missing file), FloatingPointError (training) and RuntimeError (a frame's
+    buffers) print `error: ...` on stderr and exit with 2, Ctrl-C exits with 130. `--traceback` or
+    NIMPOSTOR_TRACEBACK=1 lets the error through instead.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -167,11 +168,11 @@ def run_cli(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(130)
-    except (ValueError, TypeError, OSError) as error:
+    except (ValueError, TypeError, OSError, FloatingPointError, RuntimeError) as error:
         if "--traceback" in arguments or os.environ.get(TRACEBACK_VARIABLE, "0") != "0":
             raise
-        # A TypeError is seldom the user's doing: say how to see where it comes from.
-        hint = " (--traceback shows where)" if isinstance(error, TypeError) else ""
+        # These are seldom the user's doing: say how to see where they come from.
+        hint = " (--traceback shows where)" if isinstance(error, TypeError | RuntimeError) else ""
         message = " ".join(str(error).split()) or type(error).__name__
         print(f"error: {message}{hint}", file=sys.stderr)
         sys.exit(2)
@@ -195,7 +196,7 @@ class _LiteralsOnly(config_parser.ParserDelegate):
 
 
 def _bind_file(path: Path, places: dict[str, str], including: tuple[Path, ...]) -> None:
-    if path in including:
+    if path.resolve() in [other.resolve() for other in including]:
         raise ValueError(f"{path} includes itself through {including[-1]}")
     try:
         text = path.read_text(encoding="utf-8")

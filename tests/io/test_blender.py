@@ -92,7 +92,7 @@ def test_cameras_far_from_the_origin(make_scene, rgba):
     """What float32 cannot tell apart is refused; some thousands of distances are fine."""
     folder = make_scene([rgba(64, 64), rgba(64, 64)])
     meta = read_transforms(folder, "train")
-    for shift, fine in ((1e4, True), (1e7, False)):
+    for shift, fine in ((1e4, True), (1e7, False), (1e9, False)):
         moved = copy.deepcopy(meta)
         for frame in moved["frames"]:
             frame["transform_matrix"][0][3] += shift
@@ -102,6 +102,15 @@ def test_cameras_far_from_the_origin(make_scene, rgba):
         else:
             with pytest.raises(ValueError, match=r"transforms_train.json: .*; subtract that point from all"):
                 load_blender(folder, "train")
+
+
+def test_masks_in_files_of_their_own_are_refused(make_scene, rgba):
+    folder = make_scene([rgba(4, 4), rgba(4, 4)])
+    meta = read_transforms(folder, "train")
+    meta["frames"][1]["mask_path"] = "masks/r_1.png"
+    write_transforms(folder, "train", meta)
+    with pytest.raises(ValueError, match=r"frame 1: 'mask_path' is not read: write the masks into"):
+        load_blender(folder, "train")
 
 
 def test_select(make_scene, rgba):

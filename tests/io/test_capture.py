@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from PIL import Image
 from scene_files import camera_to_world
 from scipy import ndimage
 
+from nimpostor_jax.io import capture as capture_module
 from nimpostor_jax.io.blender import load_blender
 from nimpostor_jax.io.capture import common_crops, read_capture, write_views
 from nimpostor_jax.io.colmap import Lens, require_pycolmap
@@ -254,7 +256,38 @@ def test_an_image_with_a_mask_is_refused(tmp_path, plain):
         undistorted_views(folder, tmp_path)
 
 
+def test_masks_in_files_of_their_own_are_refused(tmp_path, plain):
+    """They would be left out."""
+    frames = [{}, {"mask_path": "masks/p1.png"}, {}]
+    folder = write_folder(tmp_path / "data", plain, INTRINSICS, frames)
+    with pytest.raises(ValueError, match=r"transforms\.json: frame 1: 'mask_path' is not read.*train\.py"):
+        read_capture(folder, tmp_path, log=lambda _: None)
+
+
 # Images alone
+
+
+def test_poses_of_other_images_are_not_taken(tmp_path, plain, monkeypatch):
+    """Cameras number their pictures alike: the names are the same, and the pictures are not."""
+    lens = Lens("PINHOLE", WIDTH, HEIGHT, (130.0, 128.0, 63.0, 42.0))
+
+    def poses(images, names, output, log):
+        (output / "sparse" / "0").mkdir(parents=True)
+        (output / "sparse" / "0" / "cameras.bin").write_bytes(b"")
+        return output / "sparse" / "0"
+
+    def model(path):
+        return [SimpleNamespace(name=f"p{i}.png", lens=lens, camera_to_world=np.eye(4)) for i in range(3)]
+
+    monkeypatch.setattr(capture_module, "poses_from_images", poses)
+    monkeypatch.setattr(capture_module, "read_model", model)
+    work = tmp_path / "work"
+    for name, pictures in (("a", plain), ("b", [np.zeros_like(x) for x in plain])):
+        (write_folder(tmp_path / name, pictures, INTRINSICS) / "transforms.json").unlink()
+    for _ in range(2):
+        assert len(read_capture(tmp_path / "a", work, log=lambda _: None).paths) == 3
+    with pytest.raises(ValueError, match=r"colmap has the poses of other images than .*b.images; remove it"):
+        read_capture(tmp_path / "b", work, log=lambda _: None)
 
 
 def textured_ball(pose, focal, side, lattice):

@@ -70,7 +70,10 @@ def test_reads_the_reference_scenes():
         ({"name": "bend", "c": "0.5"}, "'c' must be a finite number, got '0.5'"),
         ({"name": "bend", "c": True}, "'c' must be a finite number"),
         ('{"name": "bend", "c": NaN}', "'c' must be a finite number"),
-        ({"name": "bend", "c": 0}, "deformation.json: bend: c must not be 0"),
+        (
+            {"name": "drag", "center": [0] * 3, "radius": 0, "translation": [0] * 3, "rotation_vector": [0] * 3},
+            "deformation.json: drag: radius must be > 0",
+        ),
         ({"name": "rigid", "rotation": [1], "translation": [0, 0, 0]}, "shape [3, 3]"),
     ],
 )

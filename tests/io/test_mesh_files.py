@@ -82,6 +82,15 @@ def test_bad_files_say_what_is_there(tmp_path, cage):
     np.savez(tmp_path / "float.npz", V=cage[0], T=cage[1].astype(float))
     with pytest.raises(ValueError, match=r"float.npz: T must hold integers"):
         load_tets(tmp_path / "float.npz")
+    np.savez(tmp_path / "text.npz", V=cage[0].astype(str), T=cage[1])
+    with pytest.raises(ValueError, match=r"text.npz: V must hold numbers"):
+        load_tets(tmp_path / "text.npz")
+    np.savez(tmp_path / "wide.npz", V=cage[0], T=cage[1].astype(np.int64) + (1 << 32))
+    with pytest.raises(ValueError, match=r"wide.npz: 6 tets with indices outside"):
+        load_tets(tmp_path / "wide.npz")
+    np.savez(tmp_path / "triangles.npz", V=cage[0], T=cage[1][:, :3])
+    with pytest.raises(ValueError, match=r"triangles.npz: need .* tets \[m, 4\]"):
+        load_tets(tmp_path / "triangles.npz", orient=True)
     whole = (tmp_path / "here.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(ValueError, match=r"cut.npz: not an .npz archive"):

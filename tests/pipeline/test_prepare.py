@@ -1,12 +1,14 @@
 """pipeline.prepare: what the scene says about the config."""
 
+import dataclasses
 import os
 
 import pytest
 
 from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.gin_flags import load_config
-from nimpostor_jax.pipeline.prepare import SMALL_LOOPS, fit_levels, prepare, use_all_cores
+from nimpostor_jax.pipeline import prepare as prepare_module
+from nimpostor_jax.pipeline.prepare import SMALL_LOOPS, fit_levels, load_cage, prepare, use_all_cores
 
 
 @pytest.mark.parametrize("pixels, levels", [(100.0, 13), (20.0, 10), (0.1, 1)])
@@ -25,6 +27,25 @@ def test_small_loops_are_compiled_as_a_whole_unless_the_user_has_such_options(ow
     monkeypatch.setenv("XLA_FLAGS", flags)
     use_all_cores()
     assert os.environ["XLA_FLAGS"] == (flags if own else f"{flags} {SMALL_LOOPS}")
+
+
+def test_a_cage_is_read_before_pictures_are(monkeypatch):
+    def read(*_):
+        raise AssertionError("pictures were read first")
+
+    monkeypatch.setattr(prepare_module, "load_scene", read)
+    with pytest.raises(FileNotFoundError, match=r"gone\.npz: no such cage file"):
+        prepare(load_config(), "fluffy_ball", cage="gone.npz")
+
+
+def test_opaque_alpha_is_no_mask(config, cage):
+    """Pictures that were saved with an alpha channel of ones; a cage does not have to hold all they show."""
+    scene = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
+    opaque = scene.train.images.copy()
+    opaque[..., 3] = 1
+    train = dataclasses.replace(scene.train, images=opaque)
+    assert scene.train.show_masks and train.has_alpha.all() and not train.show_masks
+    load_cage(config, train, cage, None, lambda _: None)
 
 
 def test_a_step_that_is_not_known_is_asked_for_before_anything_is_read():

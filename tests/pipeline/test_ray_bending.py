@@ -4,8 +4,10 @@ import jax
 import numpy as np
 import oracles
 import pytest
+import scenes
 from meshes import MESHES
 from numpy.testing import assert_allclose
+from scenes import constant_density
 
 from nimpostor_jax.config import EncodingConfig, ImpostorConfig
 from nimpostor_jax.field.impostor import init_impostor
@@ -55,6 +57,26 @@ def test_the_field_is_asked_at_rest(bent, rng):
     assert_allclose(values[0][both], values[1][both], rtol=1e-4)  # float32 coordinates
 
 
+@pytest.mark.parametrize("stretched", [1.0, 1.6])
+def test_a_constant_field_has_the_analytic_opacity(stretched):
+    """exp(b) a unit of the box's frame, whichever way the cage is stretched; straight through the middle."""
+    vertices, tets = MESHES["cube"]()
+    encoding = EncodingConfig(layout="box", interpolation="grid", num_levels=2, base_resolution=4)
+    box = build_tet_mesh(*box_tets(np.array([[0.0] * 3, [1.0] * 3])))
+    field = constant_density(init_impostor(jax.random.key(0), box, ImpostorConfig(encoding=encoding)), 0.3)
+    moved = vertices * [1, 1, stretched]
+    camera = scenes.camera(8, 8, (0.5, 0.51, 6.0), (0.5, 0.5, 0.5))
+    pixels = np.array([27, 28, 35, 36])  # the middle ones
+    color, opacity = BentField(field, vertices, moved, tets).render(camera, pixels=pixels)
+    bias = float(field.decoders["density"][-1]["bias"][0, 0])
+    # Rays are within half a pixel of upright: 1 % longer. The ends are met within a coarse interval.
+    expected = -np.expm1(-np.exp(bias) * stretched / float(box.scale))
+    assert_allclose(opacity, expected, rtol=0.02)
+    assert np.all((color > 0) & (color < opacity[:, None]))
+    away = scenes.camera(4, 4, (0.5, 0.5, 6.0), (30.0, 0.5, 6.0))
+    assert np.all(BentField(field, vertices, moved, tets).render(away)[1] == 0)
+
+
 def test_what_cannot_be_bent_is_refused(bent):
     field, vertices, _, tets = bent
     mesh = build_tet_mesh(vertices, tets)
@@ -63,3 +85,7 @@ def test_what_cannot_be_bent_is_refused(bent):
         BentField(other, vertices, vertices, tets)
     with pytest.raises(ValueError, match="not the same cage"):
         BentField(field._impostor, vertices, vertices[:-1], tets)
+    crushed = vertices.copy()
+    crushed[tets[2]] = 0.5
+    with pytest.raises(ValueError, match=r"tets of the moved cage are flat \(first: \d+\); move it less"):
+        BentField(field._impostor, vertices, crushed, tets)

@@ -7,7 +7,7 @@ from nimpostor_jax.preprocess.envelope import (
     envelope_from_surface,
     voxelize_surface,
 )
-from nimpostor_jax.preprocess.surface import check_surface, self_intersections
+from nimpostor_jax.preprocess.surface import check_surface, load_surface, self_intersections
 from nimpostor_jax.preprocess.visual_hull import OccupancyGrid
 
 
@@ -50,6 +50,36 @@ def test_separate_parts_and_thin_ones_are_enclosed():
     assert_closed_and_outward(surface)
     assert surface.body_count == 2
     assert surface.contains(np.argwhere(occupied).astype(float)).all()
+
+
+def test_closed_parts_may_touch_along_edges(tmp_path):
+    """Boxes side by side have four triangles at the edges where they touch; inside is still inside."""
+    boxes = [trimesh.creation.box(bounds=[[0, 0, z], [1, 1, z + 1]]) for z in (0.0, 1.0)]
+    trimesh.util.concatenate(boxes).export(tmp_path / "boxes.stl")
+    surface = load_surface(tmp_path / "boxes.stl")
+    assert len(surface.vertices) == 12
+    grid = voxelize_surface(surface, resolution=32, allow_self_intersections=True)
+    assert grid.occupied.shape == (16, 16, 32) and grid.occupied.all()
+    hole = trimesh.Trimesh(surface.vertices, surface.faces[:-1], process=False)
+    with pytest.raises(ValueError, match=r"not closed: \d+ boundary edges"):
+        check_surface(hole)
+
+
+def test_triangles_of_two_corners_are_dropped(tmp_path):
+    """As quads at the poles of a sphere become."""
+    angles = np.linspace(0, 2 * np.pi, 9)[:-1]
+    heights = np.linspace(0, np.pi, 6)
+    points = [[np.sin(h) * np.cos(a), np.sin(h) * np.sin(a), np.cos(h)] for h in heights for a in angles]
+    lines = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points]
+    for i in range(5):
+        for j in range(8):
+            k = (j + 1) % 8
+            quad = (i, j), (i + 1, j), (i + 1, k), (i, k)
+            lines.append("f " + " ".join(str(8 * row + column + 1) for row, column in quad))
+    (tmp_path / "sphere.obj").write_text("\n".join(lines))
+    surface = load_surface(tmp_path / "sphere.obj")
+    assert len(surface.faces) == 2 * 8 * 4  # two at each of 3 rings of quads, one at each pole's
+    check_surface(surface)
 
 
 def test_voxels_of_a_surface_contain_it_and_its_inside():

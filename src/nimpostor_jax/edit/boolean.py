@@ -87,7 +87,11 @@ def _check_choice(color: str) -> None:
 
 
 def solid_of(impostor: NeuralImpostor, threshold: float = THRESHOLD) -> ImpostorSolid:
-    """The solid that an impostor fills, as it stands. Raises ValueError for a threshold below 0."""
+    """The solid that an impostor fills, as it stands. Raises ValueError for a threshold below 0.
+
+    Objects may overlap each other. Where an object overlaps itself, after a fold, one of its tets there is
+    asked, whichever `locate` finds.
+    """
     if not threshold >= 0:
         raise ValueError(f"threshold must be >= 0, got {threshold}")
     mesh = impostor.mesh

@@ -108,32 +108,30 @@ def twist(k: Scalar) -> SpaceMap:
 
 
 def bend(c: Scalar) -> SpaceMap:
-    """The z axis rolled onto a circle of curvature c about (1/c, y, 0).
+    """The z axis rolled onto a circle of curvature c about (1/c, y, 0); the identity for c = 0.
 
-    Raises ValueError for c = 0, and when it is applied outside of jit to a point with |x| >= 1/|c|, where
-    the map would fold space.
+    x' = x cos(cz) + (1 - cos(cz)) / c and z' = sin(cz) / c - x sin(cz), written without a division by c.
+    Raises ValueError when it is applied outside of jit to a point with c x >= 1, where space would fold.
     """
-    if not isinstance(c, jax.core.Tracer) and c == 0:
-        raise ValueError("bend: c must not be 0 (leave the vertices as they are)")
 
     def space_map(points: Float[Array, "V 3"]) -> Float[Array, "V 3"]:
         x, y, z = (points[:, i] for i in range(3))
-        radius = 1 / c
-        _require_bendable(x, radius)
+        _require_bendable(x, c)
         cos, sin = jnp.cos(c * z), jnp.sin(c * z)
-        return jnp.stack([radius + (x - radius) * cos, y, -(x - radius) * sin], axis=-1)
+        rise = c * z**2 / 2 * jnp.sinc(c * z / (2 * jnp.pi)) ** 2  # jnp.sinc(u) = sin(pi u) / (pi u)
+        return jnp.stack([x * cos + rise, y, z * jnp.sinc(c * z / jnp.pi) - x * sin], axis=-1)
 
     return space_map
 
 
-def _require_bendable(x: Float[Array, " V"], radius: Scalar) -> None:
-    if isinstance(x, jax.core.Tracer) or isinstance(radius, jax.core.Tracer):
+def _require_bendable(x: Float[Array, " V"], c: Scalar) -> None:
+    if isinstance(x, jax.core.Tracer) or isinstance(c, jax.core.Tracer):
         return
-    bad = np.flatnonzero(np.abs(np.asarray(x)) >= np.abs(radius))
+    bad = np.flatnonzero(np.asarray(x) * float(c) >= 1)
     if bad.size:
         raise ValueError(
-            f"bend: {bad.size} of {len(x)} vertices have |x| >= 1/|c| = {abs(float(radius)):g}; "
-            f"first: vertex {bad[0]} with x = {float(x[bad[0]]):g}; use a smaller c"
+            f"bend: {bad.size} of {len(x)} vertices have c x >= 1, at or beyond the centre 1/c = "
+            f"{1 / float(c):g}; first: vertex {bad[0]} with x = {float(x[bad[0]]):g}; use a smaller c"
         )
 
 

@@ -20,6 +20,7 @@ from nimpostor_jax.io.images import area_downsample, image_header, read_image
 from nimpostor_jax.io.transforms import (
     DISTORTION_KEYS,
     check_near_origin,
+    check_no_masks,
     image_path,
     intrinsics,
     number,
@@ -64,6 +65,11 @@ class PosedImages:
     def masks(self) -> Float[np.ndarray, "N H W"]:
         """Alpha: the share of each pixel that the object covers."""
         return self.images[..., 3]
+
+    @property
+    def show_masks(self) -> bool:
+        """Whether alpha says where the object is: all have it, and it is not opaque everywhere."""
+        return bool(self.has_alpha.all() and self.masks.min() < 1)
 
     @property
     def cameras(self) -> Camera:
@@ -180,6 +186,7 @@ def _inspect(folder: Path, split: str) -> _Split:
     json_path = _transforms_path(folder, split)
     meta = read_json(folder, json_path)
     frames = meta["frames"]
+    check_no_masks(frames, json_path)
     matrices = np.stack([read_matrix(frame, i, json_path) for i, frame in enumerate(frames)])
     paths = tuple(image_path(folder, frame, i, json_path) for i, frame in enumerate(frames))
     headers = [image_header(path) for path in paths]

@@ -28,6 +28,7 @@ from nimpostor_jax.io.images import area_downsample, image_header, read_image, t
 from nimpostor_jax.io.transforms import (
     DISTORTION_KEYS,
     IMAGE_SUFFIXES,
+    check_no_masks,
     image_path,
     intrinsics,
     number,
@@ -102,6 +103,7 @@ def _from_transforms(folder: Path) -> Capture:
     meta = read_json(folder, json_path)
     frames = meta["frames"]
     paths, poses, lenses = [], [], []
+    check_no_masks(frames, json_path)
     for i, frame in enumerate(frames):
         poses.append(read_matrix(frame, i, json_path))
         paths.append(image_path(folder, frame, i, json_path))
@@ -172,9 +174,13 @@ def _from_images(folder: Path, output: Path, log: Log) -> Capture:
         )
     for name in names:
         image_header(images / name)
-    model = find_model(output)
+    model, sizes = find_model(output), {name: (images / name).stat().st_size for name in names}
+    record = output / "images.json"  # names alone are the same in every camera
     if model is None:
         model = poses_from_images(images, names, output, log)
+        record.write_text(json.dumps(sizes, indent=1) + "\n", encoding="utf-8")
+    elif not record.is_file() or json.loads(record.read_text(encoding="utf-8")) != sizes:
+        raise ValueError(f"{output} has the poses of other images than {images}; remove it")
     return _from_model(model, images)
 
 

@@ -22,14 +22,15 @@ _BACKGROUNDS = {"white": 1.0, "black": 0.0}
 def image_header(path: str | Path) -> tuple[int, int, bool]:
     """Width, height and whether there is an alpha channel, without decoding the pixels.
 
-    Raises FileNotFoundError for a missing file, ValueError for one that is not an 8-bit image.
+    Raises FileNotFoundError for a missing file, ValueError for one that is no image, or a grey
+    one of more than 8 bits; other channels of 16 bits are read as 8.
     """
     with _open(Path(path)) as image:
         return image.width, image.height, _has_alpha(image)
 
 
 def read_image(path: str | Path) -> tuple[Float[np.ndarray, "H W 4"], bool]:
-    """An 8-bit image as premultiplied float32 RGBA, and whether the file has an alpha channel.
+    """An image as premultiplied float32 RGBA, and whether the file has an alpha channel.
 
     Without one, alpha is 1 everywhere. Raises FileNotFoundError for a missing file, ValueError for
     one that is unreadable or truncated; both name it.

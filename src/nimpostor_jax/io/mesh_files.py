@@ -35,10 +35,11 @@ def load_tets(
     check_cage_path(path)
     check_exists(path, "cage")
     vertices, tets = _read_npz(path) if path.suffix == ".npz" else _read_meshio(path)
-    if orient and len(tets) and tets.min() >= 0 and tets.max() < len(vertices):
+    shaped = vertices.shape[1:] == (3,) and tets.shape[1:] == (4,)
+    if orient and shaped and len(tets) and tets.min() >= 0 and tets.max() < len(vertices):
         tets = orient_tets(tets, vertices)
     check_tets(vertices, tets, str(path))
-    return vertices, tets
+    return vertices, tets.astype(np.int32)
 
 
 def save_tets(
@@ -89,7 +90,9 @@ def _read_npz(path: Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 
     vertices, tets = arrays["V"], arrays["T"]
     if not np.issubdtype(tets.dtype, np.integer):
         raise ValueError(f"{path}: T must hold integers, got {tets.dtype}; write it with save_tets")
-    return vertices.astype(np.float64), tets.astype(np.int32)
+    if not np.issubdtype(vertices.dtype, np.number) or np.issubdtype(vertices.dtype, np.complexfloating):
+        raise ValueError(f"{path}: V must hold numbers, got {vertices.dtype}; write it with save_tets")
+    return vertices.astype(np.float64), tets
 
 
 def _read_meshio(path: Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 4"]]:
@@ -104,4 +107,4 @@ def _read_meshio(path: Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, 
     if not blocks:
         found = ", ".join(sorted({block.type for block in mesh.cells})) or "no cells"
         raise ValueError(f"{path}: no tetra cells in it (it has {found}); export linear tetrahedra")
-    return np.asarray(mesh.points, np.float64), np.concatenate(blocks).astype(np.int32)
+    return np.asarray(mesh.points, np.float64), np.concatenate(blocks)

@@ -61,6 +61,16 @@ def read_matrix(frame: dict[str, Any], index: int, json_path: Path) -> Float[np.
     return matrix
 
 
+def check_no_masks(frames: list[dict[str, Any]], json_path: Path) -> None:
+    """Raise ValueError for masks in files of their own, which would be left out."""
+    for i, frame in enumerate(frames):
+        if frame.get("mask_path"):
+            raise ValueError(
+                f"{json_path}: frame {i}: 'mask_path' is not read: write the masks into the images as alpha "
+                "(undistorted, for experiments/train.py), or remove the key"
+            )
+
+
 def image_path(
     folder: Path, frame: dict[str, Any], index: int, json_path: Path, key: str = "file_path"
 ) -> Path:
@@ -144,7 +154,7 @@ def check_near_origin(
     mean = positions.mean(axis=0)
     distance = np.linalg.norm(positions - mean, axis=1).max()
     rounding = np.spacing(np.abs(positions).max().astype(np.float32)) / 2
-    moved = rounding * np.median(focal) / distance if distance > rounding else 0.0
+    moved = rounding * np.median(focal) / distance if distance > 0 else 0.0
     if moved > _MAX_ROUNDING:
         raise ValueError(
             f"{source}: the cameras are within {distance:.3g} of {np.round(mean, 1).tolist()}: float32 would "

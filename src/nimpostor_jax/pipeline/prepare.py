@@ -21,7 +21,6 @@ from nimpostor_jax.preprocess.cage import Cage, cage_from_images
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
 from nimpostor_jax.preprocess.validate import (
     check_coverage,
-    check_tets,
     missed_foreground,
     quality_report,
 )
@@ -111,6 +110,8 @@ def prepare(
     """
     warn_of_slow_scatter()
     with_step(config.render, config.impostor.encoding)  # asks for a step where there must be one
+    if cage is not None:
+        load_tets(cage)  # before pictures are decoded
     train, test = load_scene(resolve_scene(data), config.data)
     log(f"{data}: {len(train)} training views, {len(test)} test views, {train.width} x {train.height}")
     built = load_cage(config, train, cage, cage_output, log)
@@ -127,7 +128,7 @@ def prepare_views(
         mesh, train.cameras, train.images, config.render.march, train.backgrounds
     )
     hits = f"{len(pool.views):,} training rays hit the cage"
-    log(f"{hits}; {missed:.4%} of opaque pixels do not" if train.has_alpha.all() else hits)
+    log(f"{hits}; {missed:.4%} of opaque pixels do not" if train.show_masks else hits)
     key = jax.random.key(config.train.seed)
     config = fit_levels(config, pixels_per_cell(vertices, tets, train, 1), log)
     impostor = init_impostor(key, mesh, config.impostor)
@@ -188,8 +189,7 @@ def load_cage(
         vertices, tets = load_tets(cage)
         if config.cage.shape == "box":
             vertices, tets = box_tets(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
-        check_tets(vertices, tets, str(cage))
-        if train.has_alpha.all():
+        if train.show_masks:
             views = (train.camera_to_world, train.focal, train.principal)
             missed = missed_foreground(vertices, tets, train.masks, *views)
             log(f"{cage}: {quality_report(vertices, tets)}; {missed}")

@@ -53,7 +53,11 @@ class BentField:
         self._around = _tets_around(self._tets, len(rest))
         corners = self._moved[self._tets]
         self._first = corners[:, 0]
-        self._to_lambda = np.linalg.inv((corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1))
+        edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
+        flat = np.flatnonzero(np.linalg.det(edges) == 0)
+        if flat.size:
+            raise ValueError(f"{flat.size} tets of the moved cage are flat (first: {flat[0]}); move it less")
+        self._to_lambda = np.linalg.inv(edges)
         self._centers = corners.mean(axis=1)
         self._radii = np.linalg.norm(corners - self._centers[:, None], axis=2).max(axis=1) * (1 + 1e-9)
 

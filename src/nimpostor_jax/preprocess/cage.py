@@ -113,7 +113,7 @@ def cage_from_surface(
     mesh = surface if isinstance(surface, trimesh.Trimesh) else load_surface(surface)
     grid = voxelize_surface(mesh, config.grid_resolution, source, allow_self_intersections)
     log(f"{source}: {len(mesh.faces)} triangles, {_describe(grid)}")
-    points = np.concatenate([mesh.vertices, mesh.triangles_center])
+    points = np.concatenate([mesh.vertices[np.unique(mesh.faces)], mesh.triangles_center])
 
     def coverage(cage: Cage) -> validate.Coverage:
         outside = validate.outside_points(points, *cage)

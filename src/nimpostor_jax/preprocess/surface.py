@@ -15,6 +15,8 @@ from jaxtyping import Bool, Float, Int
 def load_surface(path: str | Path) -> trimesh.Trimesh:
     """Read a triangle surface and merge the vertices that coincide (texture seams, split normals).
 
+    Triangles that this leaves with two corners are dropped (quads at the poles of a sphere).
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: trimesh cannot read it, or it has no triangles.
@@ -32,6 +34,8 @@ def load_surface(path: str | Path) -> trimesh.Trimesh:
         raise ValueError(f"{path}: there are no triangles in it; give a triangle surface mesh")
     surface = trimesh.Trimesh(np.asarray(mesh.vertices, np.float64), faces, process=False)
     surface.merge_vertices(merge_tex=True, merge_norm=True)
+    corners = np.sort(surface.faces, axis=1)
+    surface.update_faces((corners[:, 1:] != corners[:, :-1]).all(axis=1))
     return surface
 
 
@@ -52,6 +56,7 @@ def check_surface(
 ) -> None:
     """Raise ValueError, naming `source`, unless a surface is finite, closed and without crossings.
 
+    Closed: every edge has an even number of triangles; where closed parts touch along one, it is four.
     Crossings are transversal ones (an edge through the inside of a triangle); coincident coplanar
     triangles are not looked for.
     """
@@ -68,11 +73,12 @@ def check_surface(
         )
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     unique, counts = np.unique(edges, axis=0, return_counts=True)
-    if (counts != 2).any():
-        first = unique[np.argmax(counts != 2)].tolist()
+    open_edges = counts % 2 == 1
+    if open_edges.any():
+        first = unique[np.argmax(open_edges)].tolist()
         raise ValueError(
             f"{source}: the surface is not closed: {int((counts == 1).sum())} boundary edges "
-            f"and {int((counts > 2).sum())} edges with more than two triangles (first: {first}); "
+            f"and {int((open_edges & (counts > 2)).sum())} edges with three or more (first: {first}); "
             "close its holes (for example with a remesher), or build the cage from images"
         )
     if allow_self_intersections:
