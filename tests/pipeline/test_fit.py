@@ -93,7 +93,7 @@ def test_buffers_grow_until_all_rays_are_trained_on(bindings, cage, tmp_path):
     """At the same steps in a run that was cut off."""
     config = load_config(bindings=[*bindings, "TrainConfig.warmup_steps=1", "TrainConfig.eval_every=5"])
     scene = prepare(config, "fluffy_ball", cage=cage, log=lambda _: None)
-    march = dataclasses.replace(scene.render.march, max_tets_per_ray=2, capacity_per_ray=None)
+    march = dataclasses.replace(scene.render.march, max_tets_per_ray=3, capacity_per_ray=None)
     scene = dataclasses.replace(scene, render=dataclasses.replace(scene.render, march=march))
     messages = []
     through, progress = fit(scene, log=messages.append)
