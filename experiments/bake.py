@@ -17,7 +17,7 @@ from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.impostor_file import load_impostor, save_impostor
 from nimpostor_jax.pipeline.bake import bake
 from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, write_json
-from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
+from nimpostor_jax.pipeline.prepare import prepare_trained, use_all_cores
 from nimpostor_jax.render.frame import Frame, for_frames, frame_config, render_frame
 from nimpostor_jax.render.raster_frame import rasterize_frame
 
@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
-    scene = prepare(config, args.data, cage=args.workdir / "cage.npz")
+    scene = prepare_trained(config, args.data, impostor)
     start = time.perf_counter()
     baked = bake(impostor, scene, config.bake)
     seconds = time.perf_counter() - start
@@ -43,6 +43,11 @@ def main(argv: Sequence[str]) -> None:
     field = evaluate(impostor, scene.test, config.render, background=background)
     pictures = args.workdir / "baked"
     result = evaluate(baked, scene.test, config.render, background=background, pictures=pictures)
+
+    quality = {"psnr_field": field["psnr"], "psnr": result["psnr"], "ssim": result["ssim"]}
+    quality["bake_seconds"] = seconds
+    write_json(args.workdir / "baked.json", quality)
+    print(f"baked in {seconds:.0f} s: {field['psnr']:.2f} to {result['psnr']:.2f} dB")
 
     camera = camera_of(scene.test, 0)
     ready, textured = for_frames(impostor), for_frames(baked)
@@ -62,17 +67,7 @@ def main(argv: Sequence[str]) -> None:
             way()
             times[name].append(time.perf_counter() - start)
     fps = {name: 1 / float(np.median(values)) for name, values in times.items()}
-    write_json(
-        args.workdir / "baked.json",
-        {
-            "psnr_field": field["psnr"],
-            "psnr": result["psnr"],
-            "ssim": result["ssim"],
-            "bake_seconds": seconds,
-            "fps": fps,
-        },
-    )
-    print(f"baked in {seconds:.0f} s: {field['psnr']:.2f} to {result['psnr']:.2f} dB")
+    write_json(args.workdir / "baked.json", quality | {"fps": fps})
     print(", ".join(f"{name}: {value:.2f} frames/s" for name, value in fps.items()))
 
 

@@ -35,9 +35,16 @@ from nimpostor_jax.gin_flags import add_flags, config_from_args, load_config, ru
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline.evaluate import camera_of, write_json
-from nimpostor_jax.pipeline.prepare import Scene, prepare, use_all_cores
+from nimpostor_jax.pipeline.prepare import Scene, prepare, prepare_trained, use_all_cores
 from nimpostor_jax.render.camera import to_local
-from nimpostor_jax.render.frame import View, for_frames, frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import (
+    View,
+    for_frames,
+    frame_config,
+    on_all_devices,
+    render_frame,
+    to_image,
+)
 from nimpostor_jax.render.sampling import plan_samples
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
@@ -62,13 +69,19 @@ def main(argv: Sequence[str]) -> None:
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
-    cage, trained = None, None
+    trained = None
     config = config_from_args(args)
     if args.workdir is not None:
         config = load_config(
             [args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or []
         )
-        cage, trained = args.workdir / "cage.npz", load_impostor(args.workdir / "impostor.npz")
+        trained = load_impostor(args.workdir / "impostor.npz")
+
+    def scene() -> Scene:
+        if trained is None:
+            return prepare(config, args.data)
+        return prepare_trained(config, args.data, trained)
+
     report = {
         "device": f"{jax.devices()[0].device_kind} x {jax.local_device_count()}, {platform.machine()}",
         "versions": versions("nimpostor-jax", "jax", "jaxlib", "numpy"),
@@ -77,13 +90,12 @@ def main(argv: Sequence[str]) -> None:
     if args.peers:
         work = Work(repeats=args.repeats, frame_size=args.frame_size)
         if trained is not None:
-            scene = prepare(config, args.data, cage=cage)
-            camera = first_camera(scene, args.frame_size)
+            camera = first_camera(scene(), args.frame_size)
             work = dataclasses.replace(work, trained=(trained, camera, config.render))
         report["versions"] |= versions(*PACKAGES)
         report["rows"] = compare_all(work, args.only)
     else:
-        report |= time_own(prepare(config, args.data, cage=cage), str(args.data), trained, args)
+        report |= time_own(scene(), str(args.data), trained, args)
     report["rows"] = list(map(show, report["rows"]))
     write_json(args.out, report)
     print(f"wrote {args.out}")
@@ -208,14 +220,14 @@ def time_training(
         "ms": 1e3 * median,
         "compile_s": first - median,
         "rays": size,
-        "samples": samples,  # densities evaluated; colours and gradients of all of them, or of the visible
+        "samples": samples,  # planned; densities of those in cells that are not known to be empty
         "samples_per_second": samples / median,
         "rays_per_second": size / median,
     }
 
 
 def count_samples(scene: Scene, size: int) -> int:
-    """Samples whose density the batch of `time_training` evaluates."""
+    """Samples on the rays of the batch of `time_training`, those in empty cells included."""
     mesh = scene.impostor.mesh
     batch = draw_batch(jax.random.key(0), 0, scene.pool, size, "random")
 
@@ -252,7 +264,7 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
     every_cell = dataclasses.replace(full, skip_empty=False)
     sorting = dataclasses.replace(full, skip_sorting=False)
     everything = dataclasses.replace(every_cell, skip_sorting=False)
-    merged = for_frames(impostor)
+    merged, impostor = for_frames(impostor), on_all_devices(impostor)
     settings: dict[str, tuple[NeuralImpostor, RenderConfig, dict[str, float], bool]] = {
         "": (merged, full, {}, False),
         "_with_single_levels": (impostor, full, {}, False),

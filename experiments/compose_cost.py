@@ -22,11 +22,11 @@ from scipy.spatial.transform import Rotation
 from nimpostor_jax.config import RenderConfig
 from nimpostor_jax.edit.compose import compose
 from nimpostor_jax.geometry.topology import world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_runs, run_cli
 from nimpostor_jax.pipeline.evaluate import write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.render.camera import image_pixels, pixel_rays, to_local
-from nimpostor_jax.render.frame import frame_config, render_frame
+from nimpostor_jax.render.frame import frame_config, on_all_devices, render_frame
 from nimpostor_jax.render.renderer import render_samples
 from nimpostor_jax.render.segments import march_segments
 from nimpostor_jax.types import NeuralImpostor, Rays
@@ -47,7 +47,7 @@ def main(argv: Sequence[str]) -> None:
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
-    impostor, config = load_run(args.workdir, "DIR"), config_of_run(args.workdir, args)
+    impostor, config = load_run(args.workdir, "DIR"), config_of_runs([args.workdir], args)
     transforms = scattered(impostor, max(args.counts))
     camera = around(compose([impostor] * len(transforms), transforms), args.size, 1)[0]
     grid = image_pixels(args.size, args.size).reshape(-1, 2)
@@ -55,7 +55,7 @@ def main(argv: Sequence[str]) -> None:
     rays = pixel_rays(camera, grid[chosen])
     rows, frames = [], []
     for count in args.counts:
-        whole = compose([impostor] * count, transforms[:count])
+        whole = on_all_devices(compose([impostor] * count, transforms[:count]))
         sized = frame_config(whole, camera, config.render)
         segments, visible = (int(n) for n in counted(whole, rays, config=sized))
         rows.append({"objects": count, "segments": segments, "visible_samples": visible, "rays": len(chosen)})

@@ -23,7 +23,7 @@ from nimpostor_jax.edit.boolean import difference, intersection, symmetric_diffe
 from nimpostor_jax.edit.remesh import consolidate
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_of_runs, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_runs, run_cli, save_config
 from nimpostor_jax.io.blender import load_scene
 from nimpostor_jax.io.images import composite, read_image, write_png
 from nimpostor_jax.io.impostor_file import save_impostor
@@ -78,6 +78,7 @@ def main(argv: Sequence[str]) -> None:
         numbers["psnr_consolidated_to_live"] = metrics.psnr(images["consolidated"], images["live"])
     result = list(results.values())[-1]
     save_impostor(out / "impostor.npz", result)
+    save_config(config, out)  # with which other scripts render it
     panel = [composite(test.images[0], behind), *images.values()]
     write_png(out / "before_after.png", np.concatenate(panel, axis=1))
     write_json(out / "boolean.json", numbers)

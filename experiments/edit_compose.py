@@ -21,7 +21,7 @@ from edit_deform import load_run
 from nimpostor_jax.edit.compose import compose
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_of_runs, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_runs, run_cli, save_config
 from nimpostor_jax.io.images import write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.pipeline.evaluate import write_json
@@ -48,6 +48,7 @@ def main(argv: Sequence[str]) -> None:
     transforms = read_transforms(args.transforms) if args.transforms else side_by_side(parts)
     whole = compose(parts, transforms)
     save_impostor(args.out / "impostor.npz", whole)
+    save_config(config, args.out)  # with which other scripts render it
     cameras = around(whole, args.size, max(args.frames, 1))
     seconds = {}
     for name, impostor in {"together": whole, **{str(i): p for i, p in enumerate(parts)}}.items():

@@ -30,7 +30,7 @@ from nimpostor_jax.io.deformations import load_deformation
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, picture_name, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, evaluate, picture_name, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.pipeline.ray_bending import BentField
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
@@ -159,16 +159,17 @@ def unmoved(impostor: NeuralImpostor, truth: PosedImages, config: ExperimentConf
 def pictures_of(
     impostor: NeuralImpostor, views: PosedImages, config: ExperimentConfig
 ) -> list[np.ndarray]:
-    """What the impostor shows in each view, over the config's background."""
+    """What the impostor shows in each view, over its own background or the config's."""
     sized = frame_config(impostor, camera_of(views, 0), config.render)
-    behind = 1.0 if config.data.background == "white" else 0.0
+    behind = (views.background(i, config.data.background) for i in range(len(views)))
     frames = (render_frame(impostor, camera_of(views, i), sized) for i in range(len(views)))
-    return [to_image(frame, behind) for frame in frames]
+    return [composite_frame(*pair) for pair in zip(frames, behind, strict=True)]
 
 
 def truth_of(views: PosedImages, config: ExperimentConfig) -> list[np.ndarray]:
-    """The views' pictures over the config's background."""
-    return [composite(image, config.data.background) for image in views.images]
+    """The views' pictures over their own backgrounds or the config's."""
+    behind = (views.background(i, config.data.background) for i in range(len(views)))
+    return [composite(*pair) for pair in zip(views.images, behind, strict=True)]
 
 
 def finer_cages(
@@ -235,12 +236,11 @@ def ray_bending(
     """The baseline's row: rays bent by the same cage through a field of Cartesian coordinates."""
     cages = world_vertices(impostor.mesh), world_vertices(moved.mesh)
     bent = BentField(cartesian, *cages, np.asarray(impostor.mesh.tets))
-    background = 1.0 if config.data.background == "white" else 0.0
     start, rows = time.perf_counter(), []
-    for i, name in enumerate(views.names):
+    for i, (name, true) in enumerate(zip(views.names, truth_of(views, config), strict=True)):
         color, opacity = bent.render(camera_of(views, i))
-        image = (color + background * (1 - opacity)[:, None]).reshape(views.height, views.width, 3)
-        true = composite(views.images[i], config.data.background)
+        seen = np.column_stack([color, opacity]).reshape(views.height, views.width, 4)
+        image = composite(seen, views.background(i, config.data.background))
         rows.append({"view": name, "psnr": metrics.psnr(image, true), "ssim": metrics.ssim(image, true)})
         panel = [true, image, np.clip(4 * np.abs(true - image), 0, 1)]
         write_png(folder / "ray_bending" / picture_name(views, i), np.concatenate(panel, axis=1))

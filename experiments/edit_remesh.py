@@ -23,7 +23,7 @@ from nimpostor_jax.edit.remesh import transfer
 from nimpostor_jax.edit.subdivide import subdivide
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli, save_config
 from nimpostor_jax.io.blender import check_masks, load_scene
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import save_impostor
@@ -69,6 +69,7 @@ def main(argv: Sequence[str]) -> None:
     seconds, compiling = time.perf_counter() - start, clock.seconds
     save_tets(out / "cage.npz", world_vertices(new.mesh), np.asarray(new.mesh.tets))
     save_impostor(out / "impostor.npz", new)
+    save_config(config, out)  # with which other scripts render it
 
     camera = camera_of(test, 0)
     images, background = [], config.data.background

@@ -4,6 +4,7 @@ python experiments/evaluate.py --data=DIR --workdir=out/mic
 """
 
 import argparse
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -35,7 +36,11 @@ def main(argv: Sequence[str]) -> None:
         background=config.data.background,
         pictures=args.workdir / "pictures",
     )
-    write_json(args.workdir / "metrics.json", result)
+    file = args.workdir / "metrics.json"
+    if file.exists():  # what training noted beside its own evaluation
+        noted = json.loads(file.read_text(encoding="utf-8"))
+        result |= {name: noted[name] for name in ("steps", "train_seconds") if name in noted}
+    write_json(file, result)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nimpostor_jax.config import RenderConfig
+from nimpostor_jax.config import ExperimentConfig, RenderConfig
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.geometry.tetrahedron import FACES
 from nimpostor_jax.geometry.topology import world_vertices
@@ -28,10 +28,10 @@ from nimpostor_jax.io.blender import PosedImages, load_scene
 from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.evaluate import camera_of, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, write_json
 from nimpostor_jax.pipeline.prepare import MIN_CELL, use_all_cores
 from nimpostor_jax.render.camera import image_pixels, pixel_rays
-from nimpostor_jax.render.frame import frame_config, render_frame, to_image
+from nimpostor_jax.render.frame import frame_config, render_frame
 from nimpostor_jax.render.renderer import render_samples
 from nimpostor_jax.render.selection import optical_weights, sample_densities
 from nimpostor_jax.types import NeuralImpostor, Rays
@@ -52,6 +52,9 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--views", type=int, default=5)
     add_flags(parser)
     args = parser.parse_args(argv)
+    names = [workdir.name for workdir in args.workdir]
+    if len(set(names)) < len(names):
+        raise ValueError(f"--workdir: pictures are named after runs, which need different names, got {names}")
     use_all_cores()
     rows: list[dict[str, Any]] = []
     for workdir in args.workdir:
@@ -61,7 +64,7 @@ def main(argv: Sequence[str]) -> None:
         encoding = impostor.config.encoding
         row: dict[str, Any] = {"run": workdir.name, "layout": encoding.layout}
         row["interpolation"] = encoding.interpolation
-        row |= jumps(impostor) | in_pictures(impostor, views, config.render, args.out / f"{workdir.name}.png")
+        row |= jumps(impostor) | in_pictures(impostor, views, config, args.out / f"{workdir.name}.png")
         row["saved_by_own_levels"] = saved_by_own_levels(impostor, train)
         rows.append(row)
         print(", ".join(f"{k}: {v:.4g}" if isinstance(v, float) else f"{k}: {v}" for k, v in row.items()))
@@ -124,16 +127,17 @@ def jumps(impostor: NeuralImpostor) -> dict[str, float]:
 
 
 def in_pictures(
-    impostor: NeuralImpostor, views: PosedImages, render: RenderConfig, path: Path
+    impostor: NeuralImpostor, views: PosedImages, config: ExperimentConfig, path: Path
 ) -> dict[str, float]:
     """The error's steps across and within the borders of the tets that pixels show."""
-    sized = frame_config(impostor, camera_of(views, 0), render)
+    sized = frame_config(impostor, camera_of(views, 0), config.render)
     seen = jax.jit(partial(seen_tets, config=sized))
     across, within = [], []
     for i in range(len(views)):
         camera = camera_of(views, i)
-        image = to_image(render_frame(impostor, camera, sized))
-        truth = composite(views.images[i], "white")
+        behind = views.background(i, config.data.background)
+        image = composite_frame(render_frame(impostor, camera, sized), behind)
+        truth = composite(views.images[i], behind)
         rays = pixel_rays(camera, image_pixels(views.height, views.width).reshape(-1, 2))
         padding = -rays.origins.shape[0] % ROWS
         rays = jax.tree.map(lambda x, p=padding: jnp.pad(x, ((0, p), (0, 0)), mode="edge"), rays)

@@ -3,7 +3,7 @@
     python experiments/pareto.py --data=DIR --workdir=out/mic --out=out/pareto
 
 On a trained impostor, at the resolution of its data. The error is that to a converged float64 quadrature of
-the same field (steps of `REFERENCE_STEP`, nothing visible left out); `share_within` is the share of pixels
+the same field (an eighth of the default steps, nothing visible left out); `share_within` is that of pixels
 within the tolerance of it (without cells that training never saw), or 1/255 where none was given; the PSNR is
 that to the held-out images. `--also` adds other runs on the same data (another interpolation, layout or
 number of levels), each against its own integral. Writes `pareto.csv`, `pareto.json` and `pareto.png`.
@@ -14,7 +14,8 @@ import argparse
 import csv
 import dataclasses
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +26,17 @@ import numpy as np
 from tqdm import tqdm
 
 from nimpostor_jax.config import RenderConfig
-from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_of_run, load_config, run_cli
 from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.blender import load_scene
+from nimpostor_jax.io.images import composite
 from nimpostor_jax.io.impostor_file import load_impostor
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.metrics import psnr
-from nimpostor_jax.pipeline.evaluate import camera_of, write_json
+from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
-from nimpostor_jax.render.frame import Frame, frame_config, render_frame, to_image
-from nimpostor_jax.render.sampling import with_step
+from nimpostor_jax.render.frame import Frame, frame_config, on_all_devices, render_frame
+from nimpostor_jax.render.sampling import known_step, with_step
 from nimpostor_jax.types import Camera, NeuralImpostor
 
 matplotlib.use("Agg")
@@ -42,9 +44,9 @@ from matplotlib import pyplot as plt
 
 Row = dict[str, Any]
 
-REFERENCE_STEP = 1 / 64
-REFERENCE_SAMPLES = 1024
-REFERENCE_WEIGHT = 1e-8  # 1,024 samples of less are a 400th of an 8-bit step
+REFERENCE_REFINEMENT = 8  # of the default frame's steps
+REFERENCE_SAMPLES = 1 << 14
+REFERENCE_WEIGHT = 1e-8  # thousands of samples of less are a small part of an 8-bit step
 
 
 def main(argv: Sequence[str]) -> None:
@@ -61,40 +63,52 @@ def main(argv: Sequence[str]) -> None:
     )
     add_flags(parser)
     args = parser.parse_args(argv)
+    if args.views < 1 or args.repeats < 1:
+        raise ValueError("--views and --repeats must be >= 1")
     use_all_cores()
-    config = load_config([args.workdir / "config.gin", *(args.gin_configs or [])], args.gin_bindings or [])
-    impostor = load_impostor(args.workdir / "impostor.npz")
+    config, impostor = config_of_run(args.workdir, args), load_impostor(args.workdir / "impostor.npz")
+    render = with_step(config.render, impostor.config.encoding)
+    settings = levers(render)
+    unknown = set(args.only or []) - {s[0] for s in settings}
+    if unknown:
+        raise ValueError(f"--only: no lever {min(unknown)!r}; there are {sorted({s[0] for s in settings})}")
+    settings = [s for s in settings if not args.only or s[0] in [*args.only, "default"]]
+    impostors = {"tables": with_tables(impostor, jnp.bfloat16)}
+    for folder in args.also:  # each as it was trained to be rendered
+        if f"run {folder}" in impostors:
+            raise ValueError(f"--also {folder} is given twice")
+        impostors[f"run {folder}"] = other = load_impostor(folder / "impostor.npz")
+        own = with_step(load_config([folder / "config.gin"]).render, other.config.encoding)
+        settings.append((f"run {folder}", "", own))
+    impostor, impostors = on_all_devices((impostor, impostors))
+    args.out.mkdir(parents=True, exist_ok=True)
     _, test = load_scene(resolve_scene(args.data), config.data)
     views = np.linspace(0, len(test.images) - 1, min(args.views, len(test.images))).round().astype(int)
     cameras = [camera_of(test, view) for view in views]
-    background = 1.0 if config.data.background == "white" else 0.0
-    truths = [test.images[v][..., :3] + background * (1 - test.images[v][..., 3:]) for v in views]
-    render = with_step(config.render, impostor.config.encoding)
-    settings = [s for s in levers(render) if not args.only or s[0] in [*args.only, "default"]]
+    behind = [test.background(view, config.data.background) for view in views]
+    truths = [composite(test.images[v], b) for v, b in zip(views, behind, strict=True)]
+
+    def pictures(render_one: Callable[[Camera], Frame]) -> list[np.ndarray]:
+        return [composite_frame(render_one(c), b) for c, b in zip(cameras, behind, strict=True)]
 
     def reference(impostor: NeuralImpostor, render: RenderConfig) -> list[np.ndarray]:
-        return [to_image(reference_frame(impostor, camera, render), background) for camera in cameras]
+        return pictures(lambda camera: reference_frame(impostor, camera, render))
 
-    references = reference(impostor, dataclasses.replace(config.render, skip_empty=False))
+    references = reference(impostor, dataclasses.replace(render, skip_empty=False))
     # What a tolerance bounds is the error of integration: of the field without what training never saw.
-    seen = reference(impostor, config.render) if any(s[0] == "tolerance" for s in settings) else references
-    impostors = {"tables": with_tables(impostor, jnp.bfloat16)}
-    for folder in args.also:
-        impostors[f"run {folder.name}"] = load_impostor(folder / "impostor.npz")
-        settings.append((f"run {folder.name}", "", config.render))
+    seen = reference(impostor, render) if any(s[0] == "tolerance" for s in settings) else references
     rows = []
     for lever, value, render in settings:
         shown = impostors.get(lever, impostor)
-        sized = frame_config(shown, cameras[0], render)
+        sized, own_render = frame_config(shown, cameras[0], render), render
         if lever == "min_weight":  # which frames of mostly visible samples leave out
             sized = dataclasses.replace(sized, min_weight=render.min_weight / render.frame_refinement)
         render = sized
         tolerance = value if lever == "tolerance" else None
-        frames = [render_frame(shown, camera, render, tolerance) for camera in cameras]
-        images = [to_image(frame, background) for frame in frames]
+        images = pictures(partial(render_frame, shown, config=render, tolerance=tolerance))
         exact = seen if lever == "tolerance" else references
         if lever.startswith("run "):
-            exact = reference(shown, dataclasses.replace(config.render, skip_empty=False))
+            exact = reference(shown, dataclasses.replace(own_render, skip_empty=False))
         error = np.abs(np.array(images) - np.array(exact))
         rows.append(
             {
@@ -121,7 +135,6 @@ def main(argv: Sequence[str]) -> None:
         row["ms"] = float(np.median(row["ms"]))
         del row["render"]
     mark_front(rows)
-    args.out.mkdir(parents=True, exist_ok=True)
     write_table(args.out / "pareto.csv", rows)
     size = f"{cameras[0].width} x {cameras[0].height}"
     about = {
@@ -183,10 +196,11 @@ def with_tables(impostor: NeuralImpostor, dtype: Any) -> NeuralImpostor:
 
 
 def reference_frame(impostor: NeuralImpostor, camera: Camera, render: RenderConfig) -> Frame:
-    """The field's integral, converged, in float64."""
+    """The field's integral, converged, in float64. Raises ValueError where rays need more samples."""
+    step = known_step(render.sampler) / render.frame_refinement / REFERENCE_REFINEMENT
     sampler = dataclasses.replace(
-        render.sampler, measure="barycentric", step=REFERENCE_STEP, cone_angle=0.0,
-        max_samples_per_ray=REFERENCE_SAMPLES, capacity_per_ray=None,
+        render.sampler, step=step, cone_angle=0.0, capacity_per_ray=None,
+        max_samples_per_ray=REFERENCE_SAMPLES,
     )  # fmt: skip
     exact = dataclasses.replace(
         render, sampler=sampler, min_weight=REFERENCE_WEIGHT, frame_refinement=1.0
@@ -195,7 +209,10 @@ def reference_frame(impostor: NeuralImpostor, camera: Camera, render: RenderConf
         impostor, camera = jax.tree.map(
             lambda x: x.astype("float64") if x.dtype == "float32" else x, (impostor, camera)
         )
-        return render_frame(impostor, camera, frame_config(impostor, camera, exact))
+        frame = render_frame(impostor, camera, frame_config(impostor, camera, exact))
+    if frame.coarsened.any():
+        raise ValueError(f"a reference needs more than {REFERENCE_SAMPLES} samples on a ray of this cage")
+    return frame
 
 
 def mean_psnr(images: Sequence[np.ndarray], others: Sequence[np.ndarray]) -> float:

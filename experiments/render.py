@@ -32,13 +32,16 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--size", type=int, help="image width in pixels; default: the scene's")
     parser.add_argument("--fps", type=float, default=20.0)
-    parser.add_argument("--video", default="orbit.mp4", help="file name in the workdir: .mp4 or .gif")
+    parser.add_argument(
+        "--video", help="file in the workdir: .mp4 or .gif; default: orbit.mp4, or the deformation's name"
+    )
     add_flags(parser)
     args = parser.parse_args(argv)
     use_all_cores()
     if args.frames < 1:
         raise ValueError(f"--frames must be >= 1, got {args.frames}")
-    check_video(args.video, args.fps)
+    video = Path(args.video or ("orbit" if args.deformation is None else args.deformation.stem) + ".mp4")
+    check_video(video, args.fps)
     config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
     if args.deformation is not None:
@@ -48,14 +51,15 @@ def main(argv: Sequence[str]) -> None:
     cameras = orbit(train, args.frames, size=args.size)
     sized = frame_config(impostor, cameras[0], config.render)
     background = 1.0 if config.data.background == "white" else 0.0
-    for earlier in (args.workdir / "orbit").glob("[0-9]*.png"):
+    folder = args.workdir / "frames" / video.stem
+    for earlier in folder.glob("[0-9]*.png"):
         earlier.unlink()  # frames beyond this video's would be taken for its end
     frames = []
     for i, camera in enumerate(cameras):
         frames.append(to_image(render_frame(impostor, camera, sized), background))
-        write_png(args.workdir / "orbit" / f"{i:04d}.png", frames[-1])
-    write_video(args.workdir / args.video, np.stack(frames), args.fps)
-    print(f"wrote {args.workdir / args.video} and {len(frames)} frames in {args.workdir / 'orbit'}")
+        write_png(folder / f"{i:04d}.png", frames[-1])
+    write_video(args.workdir / video, np.stack(frames), args.fps)
+    print(f"wrote {args.workdir / video} and {len(frames)} frames in {folder}")
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from nimpostor_jax.edit.boolean import gated
 from nimpostor_jax.edit.compose import compose
 from nimpostor_jax.export.video import write_video
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
-from nimpostor_jax.gin_flags import add_flags, config_from_args, config_of_runs, run_cli
+from nimpostor_jax.gin_flags import add_flags, config_from_args, config_of_runs, run_cli, save_config
 from nimpostor_jax.io.images import write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.pipeline.fit import fit
@@ -56,6 +56,7 @@ def main(argv: Sequence[str]) -> None:
         ball, _ = fit(prepare(config, "fluffy_ball"))
     snowman = build(ball)
     save_impostor(args.out / "impostor.npz", snowman)
+    save_config(config, args.out)  # with which other scripts render it
     cameras = around(snowman, args.size, max(args.frames, 1))
     sized = frame_config(snowman, cameras[0], config.render)
     frames = [to_image(render_frame(snowman, camera, sized)) for camera in cameras]

@@ -28,7 +28,7 @@ from nimpostor_jax.field.impostor import merge_levels
 from nimpostor_jax.gin_flags import add_flags, config_of_run, run_cli
 from nimpostor_jax.io.impostor_file import load_baked, load_impostor
 from nimpostor_jax.pipeline.evaluate import write_json
-from nimpostor_jax.pipeline.prepare import prepare, use_all_cores
+from nimpostor_jax.pipeline.prepare import prepare_trained, use_all_cores
 from nimpostor_jax.render.baked import (
     BASIS,
     lit_segments,
@@ -67,8 +67,7 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     config = config_of_run(args.workdir, args)
     impostor = load_impostor(args.workdir / "impostor.npz")
-    saved = args.workdir / "cage.npz"  # the ladder's boxes are not saved, but made again
-    scene = prepare(config, args.data, cage=saved if saved.exists() else None, log=lambda _: None)
+    scene = prepare_trained(config, args.data, impostor, log=lambda _: None)
     camera = first_camera(scene, FRAME_SIZE)
     order = tile_order(camera.height, camera.width)
     rays = pixel_rays(camera, image_pixels(camera.height, camera.width).reshape(-1, 2)[order])

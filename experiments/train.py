@@ -8,12 +8,19 @@ continues from its last checkpoint when it is started again.
 """
 
 import argparse
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 from nimpostor_jax.config import ExperimentConfig
-from nimpostor_jax.gin_flags import add_flags, config_from_args, operative_config_text, run_cli
-from nimpostor_jax.io.atomic import atomic_path
+from nimpostor_jax.gin_flags import (
+    add_flags,
+    config_from_args,
+    load_config,
+    operative_config_text,
+    run_cli,
+    save_config,
+)
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.pipeline.curve import HeldOutCurve
 from nimpostor_jax.pipeline.evaluate import evaluate, write_json
@@ -46,14 +53,14 @@ def train(
     config: ExperimentConfig, data: str | Path, workdir: Path, cage: Path | None, max_minutes: float | None
 ) -> None:
     """Prepare, train, evaluate and save a run."""
+    check_finished(config, workdir)
     own_cage = workdir / "cage.npz"
     cage = cage or (own_cage if own_cage.exists() else None)
     scene = prepare(config, data, cage=cage, cage_output=own_cage)
     curve = HeldOutCurve(scene, workdir / "curve.json") if config.train.eval_every else None
     impostor, progress = fit(scene, workdir=workdir, max_minutes=max_minutes, callback=curve)
     print(f"trained {progress.step} steps in {progress.seconds / 60:.1f} minutes")
-    with atomic_path(workdir / "config.gin") as path:  # a refused run's folder keeps its own
-        path.write_text(operative_config_text(config), encoding="utf-8")
+    save_config(config, workdir)  # now: a refused run's folder keeps its own
     save_impostor(workdir / "impostor.npz", impostor)
     result = evaluate(
         impostor,
@@ -64,6 +71,26 @@ def train(
     )
     result |= {"steps": progress.step, "train_seconds": progress.seconds}
     write_json(workdir / "metrics.json", result)
+
+
+def check_finished(config: ExperimentConfig, workdir: Path) -> None:
+    """Raise ValueError where a finished run there has settings that would not be made up for by more steps.
+
+    Nothing would be trained with the new ones, but config.gin would say so.
+    """
+    if not (workdir / "config.gin").exists():
+        return
+    names = ("steps", "log_every", "eval_every", "checkpoint_every")
+    there = load_config([workdir / "config.gin"])
+    train = dataclasses.replace(there.train, **{name: getattr(config.train, name) for name in names})
+    there = dataclasses.replace(there, train=train, bake=config.bake, retrain=config.retrain)
+    mine, theirs = (operative_config_text(each).splitlines() for each in (config, there))
+    changed = [pair for pair in zip(mine, theirs, strict=True) if pair[0] != pair[1]]
+    if changed:
+        raise ValueError(
+            f"{workdir} has a finished run with {changed[0][1]}, not {changed[0][0].split(' = ')[1]}; use "
+            "another --workdir, remove it, or render it otherwise with experiments/evaluate.py"
+        )
 
 
 if __name__ == "__main__":

@@ -46,6 +46,13 @@ def test_train_and_render(tmp_path):
     assert trained["steps"] == 20
     assert len(trained["per_view"]) == 25
 
+    kept = (tmp_path / "config.gin").read_text()
+    other = [*SMALL, "TrainConfig.learning_rate=0.02", "TrainConfig.log_every=7"]
+    done = run("train.py", "--data=fluffy_ball", f"--workdir={tmp_path}", *other)
+    assert done.returncode == 2
+    assert "a finished run with TrainConfig.learning_rate = 0.01, not 0.02" in done.stderr
+    assert (tmp_path / "config.gin").read_text() == kept
+
     bend = tmp_path / "twist.json"
     bend.write_text('{"name": "twist", "k": 0.9}')
     done = run(
@@ -58,7 +65,7 @@ def test_train_and_render(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "orbit.gif").exists()
-    assert len(list((tmp_path / "orbit").glob("*.png"))) == 2
+    assert len(list((tmp_path / "frames" / "orbit").glob("*.png"))) == 2
 
 
 @pytest.mark.slow
@@ -73,6 +80,10 @@ def test_edits_come_out_of_scripts(tmp_path):
     assert done.returncode == 0, done.stderr
     result = json.loads((work / "remesh" / "remesh.json").read_text())
     assert result["psnr_to_before"] > 60 and result["tets_after"] > 3 * result["tets_before"]
+    done = run("evaluate.py", "--data=fluffy_ball", f"--workdir={work / 'remesh'}")
+    assert done.returncode == 0, done.stderr
+    psnr = json.loads((work / "remesh" / "metrics.json").read_text())["psnr"]
+    assert psnr == pytest.approx(result["psnr_after"], abs=0.01)
 
     # After 20 steps there still is haze all over the old cage, and more than 0.1 % of it beyond the new one.
     retrain = ["--gin_bindings", *few, "CageConfig.target_tets=80", "RetrainConfig.max_lost_share=0.2"]
@@ -94,6 +105,47 @@ def test_edits_come_out_of_scripts(tmp_path):
     done = run("snowman.py", f"--ball={work}", *small, timeout=900)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "snow" / "frame.png").exists()
+
+
+@pytest.mark.slow
+def test_measurements_come_out_of_scripts(tmp_path):
+    """Of a run whose folder has no cage, as the ladder's; its impostor says what cage it was trained in."""
+    work, size = tmp_path / "work", "--gin_bindings=DataConfig.resolution=32"
+    done = run("train.py", "--data=fluffy_ball", f"--workdir={work}", *SMALL)
+    assert done.returncode == 0, done.stderr
+    (work / "cage.npz").unlink()
+    run_of = ["--data=fluffy_ball", f"--workdir={work}"]
+    done = run("stages.py", *run_of, f"--out={tmp_path / 'stages.json'}", timeout=900)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "stages.json").read_text())["rows"]
+    assert {row["rays"] for row in rows} >= {"frame", "training"} and all(row["cpu_ms"] >= 0 for row in rows)
+
+    same = tmp_path / "same" / "work"
+    shutil.copytree(work, same)
+    few = ["--views=1", "--repeats=1", "--only=step", f"--also={work}", f"--also={same}"]
+    done = run("pareto.py", *run_of, f"--out={tmp_path / 'pareto'}", *few, timeout=900)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "pareto" / "pareto.json").read_text())["rows"]
+    errors = {(row["lever"], row["value"]): row["mean_error"] for row in rows}
+    assert errors["step", 1 / 16] < errors["step", 1 / 4] < errors["step", 1 / 2]
+    twins = [row["psnr"] for row in rows if row["lever"].startswith("run ")]
+    psnr = json.loads((work / "metrics.json").read_text())["per_view"][0]["psnr"]
+    assert len(twins) == 2 and twins[0] == twins[1] == pytest.approx(psnr, abs=0.01)
+
+    done = run("layouts.py", *run_of, f"--out={tmp_path / 'layouts'}", "--views=1", timeout=900)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "layouts" / "layouts.json").read_text())["rows"][0]["seams"] > 0
+    cost = [f"--out={tmp_path / 'cost.json'}", "--size=32", "--repeats=1", "--counts", "1", "2"]
+    done = run("compose_cost.py", f"--workdir={work}", *cost, timeout=900)
+    assert done.returncode == 0, done.stderr
+    quick = [f"BakeConfig.{text}" for text in ("fit_rays=20000", "novel_views=2", "refine_steps=5")]
+    done = run("bake.py", *run_of, "--gin_bindings", *quick, timeout=900)
+    assert done.returncode == 0, done.stderr
+    fps = json.loads((work / "baked.json").read_text())["fps"]
+    assert set(fps) == {"field", "baked, marched", "baked, rasterized"}
+    timed = [f"--out={tmp_path / 'times.json'}", "--repeats=1", "--frame_size=32", size]
+    done = run("benchmark.py", *run_of, *timed, timeout=900)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow

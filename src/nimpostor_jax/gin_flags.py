@@ -21,6 +21,7 @@ from gin import config_parser
 
 from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.config_dict import check_types
+from nimpostor_jax.io.atomic import atomic_path
 
 TRACEBACK_VARIABLE = "NIMPOSTOR_TRACEBACK"
 
@@ -136,6 +137,12 @@ def config_of_runs(workdirs: Sequence[Path], args: argparse.Namespace) -> Experi
                     "renders both; train them alike, or bind it"
                 )
     return configs[0]
+
+
+def save_config(config: ExperimentConfig, folder: Path) -> None:
+    """Write `config.gin`, which `config_of_run` reads, whole or not at all."""
+    with atomic_path(folder / "config.gin") as temporary:
+        temporary.write_text(operative_config_text(config), encoding="utf-8")
 
 
 def operative_config_text(config: ExperimentConfig) -> str:

@@ -178,19 +178,6 @@ def test_cut_tets_go_on_in_the_old_field_exactly():
     assert_allclose(picture(new), picture(made), atol=1e-4)
 
 
-def test_the_same_tets_are_kept_where_the_cage_overlaps_itself():
-    """And others are refused there: nothing says in which of the old ones they lie."""
-    made = scenes.pushed_together(scenes.impostor("blobs"))
-    vertices, tets = np.asarray(made.mesh.vertices, np.float64), np.asarray(made.mesh.tets)
-    turned = tets[:, [1, 2, 0, 3]]
-    over = overlay(made, vertices, turned)
-    assert_array_equal(over.tets, np.arange(len(tets)))
-    assert_array_equal(over.lambdas, np.broadcast_to(np.eye(4)[[1, 2, 0, 3]], (len(tets), 4, 4)))
-    fine = subdivide(made)
-    with pytest.raises(ValueError, match="lie where the old cage overlaps itself"):
-        overlay(made, np.asarray(fine.mesh.vertices, np.float64), np.asarray(fine.mesh.tets))
-
-
 def test_vertices_that_stay_come_to_rest_where_they_were():
     """Whatever tets they belong to now, which the tets around them do not share."""
     made = deform(scenes.impostor("delaunay"), twist(0.3))

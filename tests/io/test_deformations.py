@@ -71,7 +71,8 @@ def test_reads_the_reference_scenes():
         ({"name": "bend", "c": True}, "'c' must be a finite number"),
         ('{"name": "bend", "c": NaN}', "'c' must be a finite number"),
         (
-            {"name": "drag", "center": [0] * 3, "radius": 0, "translation": [0] * 3, "rotation_vector": [0] * 3},
+            {"name": "drag", "radius": 0}
+            | {name: [0, 0, 0] for name in ("center", "translation", "rotation_vector")},
             "deformation.json: drag: radius must be > 0",
         ),
         ({"name": "rigid", "rotation": [1], "translation": [0, 0, 0]}, "shape [3, 3]"),

@@ -65,6 +65,18 @@ def test_closed_parts_may_touch_along_edges(tmp_path):
         check_surface(hole)
 
 
+def test_walls_of_two_sides_close_nothing():
+    """A cup, each of whose triangles is there from within, too."""
+    box = trimesh.creation.box()
+    lid = np.isclose(box.triangles_center[:, 2], 0.5)
+    walls = box.faces[~lid]
+    cup = trimesh.Trimesh(box.vertices, np.concatenate([walls, walls[:, ::-1]]), process=False)
+    with pytest.raises(ValueError, match=r"not closed: all of its triangles are there twice"):
+        check_surface(cup)
+    beside = trimesh.util.concatenate([cup, trimesh.creation.box(bounds=[[2, 0, 0], [3, 1, 1]])])
+    check_surface(beside)  # a closed part, and what has no inside
+
+
 def test_triangles_of_two_corners_are_dropped(tmp_path):
     """As quads at the poles of a sphere become."""
     angles = np.linspace(0, 2 * np.pi, 9)[:-1]

@@ -7,6 +7,7 @@ from nimpostor_jax.preprocess.tetrahedralize import box_tets, run_ftetwild, tetr
 from nimpostor_jax.preprocess.tighten import tighten
 from nimpostor_jax.preprocess.validate import (
     check_tets,
+    orient_tets,
     outside_points,
     quality_report,
     signed_volumes,
@@ -132,3 +133,12 @@ def test_tightening_keeps_the_points_and_loses_volume():
     assert ball.volume < after.volume < 0.5 * before.volume
     assert after.num_overlapping_tets == 0
     np.testing.assert_array_equal(tight, tighten(vertices, tets, points))  # deterministic
+
+
+def test_tets_on_one_side_of_a_face_are_not_sound():
+    """As fTetWild's inverted ones are after they were turned around: it is to try again."""
+    vertices, tets = box_tets(np.array([[0.0] * 3, [1.0] * 3]))
+    assert module._is_sound(vertices, tets)
+    inner = np.concatenate([vertices, [[0.5, 0.6, 0.7]]])
+    beside = orient_tets(np.append(tets[0, :3], 8)[None], inner)
+    assert not module._is_sound(inner, np.concatenate([tets[:1], beside]))

@@ -19,7 +19,7 @@ from nimpostor_jax.edit.region import with_region
 from nimpostor_jax.edit.retrain import retrain
 from nimpostor_jax.field import impostor as field
 from nimpostor_jax.field.solids import CLOSED, MIXED, OPEN, is_kept, to_cells
-from nimpostor_jax.geometry.locate import locate
+from nimpostor_jax.geometry.locate import find_tets, locate, locate_tables
 from nimpostor_jax.geometry.topology import build_in_frame, world_vertices
 from nimpostor_jax.types import NeuralImpostor, TetMesh
 
@@ -48,12 +48,12 @@ def transfer(
     """The old impostor, as it stands, in a new cage of world-space vertices and positively oriented tets.
 
     New tets within an old one (kept or cut ones) go on in its field, exactly; the others get tables and
-    decoders of their own and two-stage retraining. `render` is that of training.
+    decoders of their own and two-stage retraining. `render` is that of training. Where the old cage overlaps
+    itself, only tets of the same vertices go on; others learn what pictures show, from either layer's field.
 
     Raises:
         ValueError: a bad mesh, live operations or several objects in the impostor, cages that do not overlap,
-            more than `config.max_lost_share` of what the old field shows outside of the new cage, or new tets
-            where the old cage overlaps itself (found by the middles of its tets).
+            or more than `config.max_lost_share` of what the old field shows outside of the new cage.
     """
     if old.gates or old.paints:
         raise ValueError("consolidate live operations (gates, paints) before the impostor is remeshed")
@@ -164,40 +164,54 @@ def overlay(
 ) -> Overlay:
     """Which new tets lie within single old ones, as both stand; vertices in the old mesh's frame.
 
-    Tets of the same vertices are the same, also where the old cage overlaps itself. Raises ValueError for
-    other tets there: nothing says which of the old ones they are to go on in.
+    Tets of the same vertices are the same, also where the old cage overlaps itself. Others do not count as
+    within one of two there.
     """
     corners = local[tets]
     middles = corners.mean(axis=1)
     old_tets = np.asarray(old.mesh.tets)
     old_corners = np.asarray(old.mesh.vertices, np.float64)[old_tets]
-    old_middles = old_corners.mean(axis=1)
     same = _same_tets(old_tets, twins_of(old.mesh, local)[tets])
     found = np.where(same >= 0, same, _located(old.mesh, middles))
-    _, near = cKDTree(old_middles).query(middles)
+    _, near = cKDTree(old_corners.mean(axis=1)).query(middles)
     nearest = np.where(found >= 0, found, near)
-    own = _located(old.mesh, old_middles)
-    # A sliver that a deformation turned inside out is no fold: its place is that of its neighbours.
-    upright = np.linalg.det(old_corners[:, 1:] - old_corners[:, :1]) > 0
-    twice = np.flatnonzero(upright & (own >= 0) & upright[own] & (own != np.arange(len(own))))
-    unclear = (same < 0) & np.isin(found, np.concatenate([twice, own[twice]]))
-    if unclear.any():
-        raise ValueError(
-            f"{unclear.sum()} of {len(tets)} new tets (first: {np.argmax(unclear)}) lie where the old cage "
-            "overlaps itself, so that their field is not defined; remesh before the cage is folded, or keep "
-            "its tets there"
-        )
-    edges = (old_corners[:, 1:] - old_corners[:, :1])[nearest]  # [T, 3, 3], rows are edges
-    flat = np.abs(np.linalg.det(edges)) <= 0
-    edges = np.where(flat[:, None, None], np.eye(3), edges)
-    slopes = np.linalg.inv(edges)  # [T, 3, 3]: columns are the gradients of the last three coordinates
-    slopes = np.concatenate([-slopes.sum(axis=2, keepdims=True), slopes], axis=2)
-    lambdas = np.einsum("tcx,txe->tce", corners - old_corners[nearest][:, :1], slopes)
-    lambdas[:, :, 0] += 1
-    off = np.abs(lambdas - np.rint(lambdas)) / np.linalg.norm(slopes, axis=1)[:, None]  # as distances
+    unclear = (same < 0) & _overlapping(old.mesh, old_corners)[nearest]
+    lambdas, lengths, flat = _coordinates(old_corners[nearest], corners)
+    off = np.abs(lambdas - np.rint(lambdas)) * lengths[:, None]  # as distances
     lambdas = np.where(off < _INSIDE, np.rint(lambdas), lambdas)
-    within = (found >= 0) & ~flat & np.all(lambdas >= 0, axis=(1, 2))
+    within = (found >= 0) & ~flat & ~unclear & np.all(lambdas >= 0, axis=(1, 2))
     return Overlay(tets=np.where(within, nearest, -1), lambdas=lambdas, nearest=nearest)
+
+
+def _coordinates(
+    corners: Float[np.ndarray, "n 4 3"], points: Float[np.ndarray, "n k 3"]
+) -> tuple[Float[np.ndarray, "n k 4"], Float[np.ndarray, "n 4"], Bool[np.ndarray, " n"]]:
+    """Points in the coordinates of a tet each; what a unit of these is as a distance; which tets are flat."""
+    edges = corners[:, 1:] - corners[:, :1]  # [n, 3, 3], rows are edges
+    flat = np.abs(np.linalg.det(edges)) <= 0
+    slopes = np.linalg.inv(np.where(flat[:, None, None], np.eye(3), edges))
+    # [n, 3, 4]: columns are the gradients of the coordinates
+    slopes = np.concatenate([-slopes.sum(axis=2, keepdims=True), slopes], axis=2)
+    lambdas = np.einsum("nkx,nxe->nke", points - corners[:, :1], slopes)
+    lambdas[:, :, 0] += 1
+    return lambdas, 1 / np.linalg.norm(slopes, axis=1), flat
+
+
+def _overlapping(mesh: TetMesh, corners: Float[np.ndarray, "O 4 3"]) -> Bool[np.ndarray, " O"]:
+    """Upright tets of which a sample (the middle, half-way to a corner) is in another upright one, and those.
+
+    A sliver that a deformation turned inside out is no fold: its place is that of its neighbours.
+    """
+    middles = corners.mean(axis=1, keepdims=True)
+    samples = np.concatenate([middles, (middles + corners) / 2], axis=1).reshape(-1, 3)
+    owners, others = np.arange(len(corners)).repeat(5), _located(mesh, samples)
+    upright = np.linalg.det(corners[:, 1:] - corners[:, :1]) > 0
+    rows = np.flatnonzero((others >= 0) & (others != owners) & upright[owners] & upright[others])
+    lambdas, lengths, _ = _coordinates(corners[others[rows]], samples[rows, None])
+    rows = rows[np.all(lambdas[:, 0] * lengths > _INSIDE, axis=1)]  # not by a rounding
+    overlapping = np.zeros(len(corners), bool)
+    overlapping[owners[rows]] = overlapping[others[rows]] = True
+    return overlapping
 
 
 def _same_tets(old: Int[np.ndarray, "O 4"], new: Int[np.ndarray, "T 4"]) -> Int[np.ndarray, " T"]:
@@ -205,14 +219,14 @@ def _same_tets(old: Int[np.ndarray, "O 4"], new: Int[np.ndarray, "T 4"]) -> Int[
     rows = np.sort(np.concatenate([old, new]), axis=1)
     _, kinds = np.unique(rows, axis=0, return_inverse=True)
     tet_of = np.full(kinds.max() + 1, -1)
+    kinds = kinds.reshape(-1)  # NumPy 2.0 keeps the axis
     tet_of[kinds[: len(old)]] = np.arange(len(old))
     return tet_of[kinds[len(old) :]]
 
 
 def _located(mesh: TetMesh, local: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """The mesh's tets that hold points of its frame, or -1."""
-    world = np.asarray(mesh.center) + np.float64(mesh.scale) * local
-    return np.asarray(locate(mesh, jnp.asarray(world, mesh.vertices.dtype))[0])
+    return np.asarray(find_tets(locate_tables(mesh), jnp.asarray(local, mesh.vertices.dtype)))
 
 
 def _at_rest(
@@ -224,14 +238,17 @@ def _at_rest(
     owner = np.where(around >= 0, around, owner)
     kept = over.tets >= 0
     owner[tets[kept].reshape(-1)] = np.repeat(over.tets[kept], 4)
-    old_tets = np.asarray(old.mesh.tets)[owner]
+    old_tets = np.asarray(old.mesh.tets)
     moved, rest = (
-        np.asarray(x, np.float64)[old_tets] for x in (old.mesh.vertices, old.rest_vertices)
+        np.asarray(x, np.float64)[old_tets[owner]] for x in (old.mesh.vertices, old.rest_vertices)
     )  # [V, 4, 3]
     inverse = np.linalg.pinv(moved[:, 1:] - moved[:, :1])
     weights = np.einsum("vx,vxe->ve", local - moved[:, 0], inverse)
     placed = rest[:, 0] + np.einsum("ve,vex->vx", weights, rest[:, 1:] - rest[:, :1])
     twins = twins_of(old.mesh, local)
+    tet, corner = np.nonzero(kept[:, None] & (over.lambdas.max(axis=2) == 1))
+    # Of vertices that have come to lie together, the one whose tet is kept
+    twins[tets[tet, corner]] = old_tets[over.tets[tet], over.lambdas[tet, corner].argmax(axis=1)]
     placed = np.where(twins[:, None] >= 0, np.asarray(old.rest_vertices)[twins], placed)
     return jnp.asarray(placed, old.mesh.vertices.dtype)
 

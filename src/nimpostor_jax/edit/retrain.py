@@ -50,6 +50,7 @@ from nimpostor_jax.train.step import (
     Metrics,
     Parameters,
     RayBatch,
+    is_finite,
     loss_gradient,
     make_optimizer,
     trainable,
@@ -83,7 +84,8 @@ def retrain(
 ) -> NeuralImpostor:
     """The new impostor with its region trained to look like the old one. Host loop around two jitted steps.
 
-    Both stand in the same world. `render` is that of training; buffers are fitted here.
+    Both stand in the same world. `render` is that of training; buffers are fitted here. Raises
+    FloatingPointError where a parameter is not finite afterwards.
     """
     if not region.tets.size:
         return new
@@ -106,6 +108,8 @@ def retrain(
     if config.render_steps:
         state, losses = _render_stage(pool, new, region, render, config, state, optimizer, rates)
         _log_stage(log, "colours", losses)
+    if not is_finite(state.part):
+        raise FloatingPointError("the region is not finite after retraining; lower RetrainConfig's rates")
     return with_trained_part(new, region, state.part)
 
 

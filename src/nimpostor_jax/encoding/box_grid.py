@@ -33,8 +33,9 @@ def build_box_layout(
 ) -> BoxLayout:
     """The layout for a cage at rest: 2**`log2_table_size` entries a level at most. Host code."""
     vertices, table = np.asarray(vertices, np.float64), 1 << config.log2_table_size
-    low = vertices.min(axis=0)
-    side = (vertices.max(axis=0) - low).max()
+    used = vertices[np.unique(tets)]
+    low = used.min(axis=0)
+    side = (used.max(axis=0) - low).max()
     nodes = [(resolution + 1) ** 3 for resolution in config.resolutions]
     return BoxLayout(
         starts=jnp.asarray([0, *itertools.accumulate(min(n, table) for n in nodes)], jnp.int32),

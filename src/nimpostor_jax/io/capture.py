@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from nimpostor_jax.io.atomic import atomic_path
 from nimpostor_jax.io.colmap import (
     Lens,
     find_model,
@@ -175,11 +176,14 @@ def _from_images(folder: Path, output: Path, log: Log) -> Capture:
     for name in names:
         image_header(images / name)
     model, sizes = find_model(output), {name: (images / name).stat().st_size for name in names}
-    record = output / "images.json"  # names alone are the same in every camera
+    record = output.with_name(f"{output.name}.json")  # names alone are the same in every camera
     if model is None:
+        with atomic_path(record) as temporary:
+            temporary.write_text(json.dumps(sizes, indent=1) + "\n", encoding="utf-8")
         model = poses_from_images(images, names, output, log)
-        record.write_text(json.dumps(sizes, indent=1) + "\n", encoding="utf-8")
-    elif not record.is_file() or json.loads(record.read_text(encoding="utf-8")) != sizes:
+    elif not record.is_file():
+        raise ValueError(f"{record}, which says what {output} is made from, is missing; remove {output}")
+    elif json.loads(record.read_text(encoding="utf-8")) != sizes:
         raise ValueError(f"{output} has the poses of other images than {images}; remove it")
     return _from_model(model, images)
 

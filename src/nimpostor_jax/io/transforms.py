@@ -152,7 +152,8 @@ def check_near_origin(
     """
     positions = camera_to_world[:, :3, 3]
     mean = positions.mean(axis=0)
-    distance = np.linalg.norm(positions - mean, axis=1).max()
+    offsets = positions - positions[0]  # of cameras in one place exactly 0
+    distance = np.linalg.norm(offsets - offsets.mean(axis=0), axis=1).max()
     rounding = np.spacing(np.abs(positions).max().astype(np.float32)) / 2
     moved = rounding * np.median(focal) / distance if distance > 0 else 0.0
     if moved > _MAX_ROUNDING:

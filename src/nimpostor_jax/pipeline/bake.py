@@ -40,7 +40,7 @@ from nimpostor_jax.train.bake import (
 from nimpostor_jax.train.pool import PixelPool, build_pool, draw_batch
 from nimpostor_jax.train.refine import count_lit, init_refinement, refine_step, with_tables
 from nimpostor_jax.train.sharding import device_mesh, dividing_devices, over_rays, replicated, sums_by_device
-from nimpostor_jax.train.step import RayBatch
+from nimpostor_jax.train.step import RayBatch, is_finite
 from nimpostor_jax.types import BakedImpostor, Embedding, HashTables, NeuralImpostor
 
 FIT_RAYS = 8192  # a call
@@ -270,11 +270,8 @@ def refine(
         if i % SYNC_EVERY == 0:
             jax.block_until_ready(loss_and_lost)
     losses, lost = np.array(found).T
-    if not np.isfinite(losses).all():
-        raise FloatingPointError(
-            f"the loss is {losses[~np.isfinite(losses)][0]} in step {np.argmax(~np.isfinite(losses))} of "
-            "refinement; lower BakeConfig.learning_rate"
-        )
+    if not is_finite((state.tables, state.decoders)):
+        raise FloatingPointError("textures are not finite after refinement; lower BakeConfig.learning_rate")
     first, last = losses[:20].mean(), losses[-20:].mean()
     log(f"refined: loss {first:.2e} to {last:.2e} in {config.refine_steps} steps")
     log_lost(lost.mean(), log)

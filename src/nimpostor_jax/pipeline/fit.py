@@ -6,6 +6,7 @@ batches are functions of seed and step, and the learning rate of step and schedu
 
 import csv
 import dataclasses
+import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +20,7 @@ from tqdm.auto import tqdm
 
 from nimpostor_jax.config import RenderConfig, TrainConfig
 from nimpostor_jax.io.atomic import atomic_path
+from nimpostor_jax.io.blender import PosedImages
 from nimpostor_jax.io.checkpoint import (
     cage_fingerprint,
     latest_step,
@@ -27,12 +29,13 @@ from nimpostor_jax.io.checkpoint import (
     save_checkpoint,
 )
 from nimpostor_jax.pipeline.prepare import Log, Scene
-from nimpostor_jax.render.capacity import grow_march
+from nimpostor_jax.render.capacity import MAX_GROWTH, grow_march
 from nimpostor_jax.train.pool import draw_batch
 from nimpostor_jax.train.sharding import data_parallel, device_mesh, dividing_devices, over_rays, replicated
 from nimpostor_jax.train.step import (
     TrainState,
     init_state,
+    is_finite,
     learning_rate,
     loss_gradient,
     make_optimizer,
@@ -53,8 +56,8 @@ LOG_FIELDS = (
     "overflow",
     "coarsened",
 )
-# Share of a batch's rays that may be left out before the buffers grow: the longest are so in every step, and
-# what only they see would not be trained.
+# Share of a batch's rays that may be left out before the buffers grow: what only they see would not be
+# trained, since rays that do not fit once never do.
 MAX_OVERFLOW = 1e-3
 
 
@@ -94,7 +97,7 @@ def fit(
     state = init_state(scene.impostor, optimizer, config.cells_per_edge, config.occupancy)
     progress = Progress()
     checkpoints = Path(workdir) / "checkpoints" if workdir is not None else None
-    identity = {"cage": cage_fingerprint(scene.impostor.mesh)}
+    identity = {"cage": cage_fingerprint(scene.impostor.mesh), "pictures": _fingerprint(scene.train)}
     if checkpoints is not None and latest_step(checkpoints) is not None:
         state, step = restore_checkpoint(checkpoints, state, scene.config, metadata=identity)
         saved = load_metadata(checkpoints, step)
@@ -154,7 +157,8 @@ def fit(
                 bar.set_postfix({k: f"{record[k]:.4g}" for k in ("loss", "psnr", "rays_per_second")})
             clock = time.perf_counter()
             # At steps that do not depend on where a process began
-            if regular and record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps:
+            lost = regular and record["overflow"] > MAX_OVERFLOW and progress.step > config.warmup_steps
+            if lost and progress.growths < MAX_GROWTH:
                 render = _grow(render)
                 progress.growths += 1
                 clock = None  # the next step compiles
@@ -177,17 +181,20 @@ _SYNC_EVERY = 8  # steps that may be under way at once
 _OCCUPANCY_EVERY = 16  # steps, as in Instant-NGP
 
 
+def _fingerprint(views: PosedImages) -> str:
+    """Identifies training views by their cameras and every fourth pixel of every fourth row."""
+    digest = hashlib.sha256()
+    for values in (views.images[:, ::4, ::4], views.camera_to_world, views.focal, views.principal):
+        digest.update(np.ascontiguousarray(values, "<f4").tobytes())
+    return digest.hexdigest()[:16]
+
+
 def _check_finite(state: TrainState, step: int) -> None:
-    if not _is_finite(state.parameters):
+    if not is_finite(state.parameters):
         raise FloatingPointError(
             f"parameters are not finite after step {step}; lower TrainConfig.learning_rate, and remove the "
             "folder or go on from its last checkpoint, which is from before"
         )
-
-
-@jax.jit
-def _is_finite(tree: dict) -> jax.Array:
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
 
 
 def _trained(scene: Scene, state: TrainState, devices: Sequence[jax.Device]) -> NeuralImpostor:
@@ -197,12 +204,14 @@ def _trained(scene: Scene, state: TrainState, devices: Sequence[jax.Device]) -> 
 
 
 def _grow(config: RenderConfig) -> RenderConfig:
-    """Twice the slots of every buffer."""
-    sampler = config.sampler
-    most = sampler.max_samples_per_ray
+    """Twice the slots of every buffer; those that rays share do not become as large as if all needed most."""
+    sampler, march = config.sampler, config.march
+    most, shared = sampler.max_samples_per_ray, march.capacity_per_ray
     capacity = min(most, 2 * (sampler.capacity_per_ray or most))
+    grown = grow_march(config)
     return dataclasses.replace(
-        grow_march(config),
+        grown,
+        march=dataclasses.replace(grown.march, capacity_per_ray=shared and 2 * shared),
         sampler=dataclasses.replace(sampler, capacity_per_ray=capacity, occupied_per_ray=None),
     )
 

@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from nimpostor_jax.config import ExperimentConfig, RenderConfig
 from nimpostor_jax.field.impostor import init_impostor
-from nimpostor_jax.geometry.topology import build_tet_mesh
+from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.io.blender import PosedImages, check_masks, load_scene
 from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
@@ -33,6 +33,7 @@ from nimpostor_jax.types import NeuralImpostor
 
 Log = Callable[[str], None]
 
+PROBE_RAYS = 8192  # that buffers are measured on
 MIN_CELL = 0.5  # pixels across a cell of the finest level
 # XLA's CPU back end compiles a loop whose body touches fewer bytes into one function, instead of calling one
 # for each operation. This takes in the march of a tile of rays, but no loop over chunks of samples.
@@ -134,12 +135,21 @@ def prepare_views(
     impostor = init_impostor(key, mesh, config.impostor)
     entries = np.diff(impostor.tables.layout.starts).tolist()
     log(f"{len(tets)} tets, {sum(entries):,} table entries in {len(entries)} levels {entries}")
-    probe = draw_batch(key, 0, pool, min(config.train.rays_per_batch, 8192), "white")
+    probe = draw_batch(key, 0, pool, PROBE_RAYS, "white")
     entries = pool.entries.slots
     march = dataclasses.replace(config.render.march, max_entries_per_ray=entries)
     render = with_step(dataclasses.replace(config.render, march=march), config.impostor.encoding)
     render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, render)
     return Scene(config=config, train=train, test=test, impostor=impostor, pool=pool, render=render)
+
+
+def prepare_trained(
+    config: ExperimentConfig, data: str | Path, impostor: NeuralImpostor, log: Log = print
+) -> Scene:
+    """A scene in the cage of an impostor at rest that was trained on it. Errors as `prepare`."""
+    train, test = load_scene(resolve_scene(data), config.data)
+    cage = world_vertices(impostor.mesh), np.asarray(impostor.mesh.tets)
+    return prepare_views(config, train, test, cage, log)
 
 
 def fit_levels(config: ExperimentConfig, pixels_per_edge: float, log: Log = print) -> ExperimentConfig:
@@ -188,7 +198,8 @@ def load_cage(
     else:
         vertices, tets = load_tets(cage)
         if config.cage.shape == "box":
-            vertices, tets = box_tets(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+            used = vertices[np.unique(tets)]
+            vertices, tets = box_tets(np.stack([used.min(axis=0), used.max(axis=0)]))
         if train.show_masks:
             views = (train.camera_to_world, train.focal, train.principal)
             missed = missed_foreground(vertices, tets, train.masks, *views)

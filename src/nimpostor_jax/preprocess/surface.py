@@ -57,6 +57,7 @@ def check_surface(
     """Raise ValueError, naming `source`, unless a surface is finite, closed and without crossings.
 
     Closed: every edge has an even number of triangles; where closed parts touch along one, it is four.
+    Triangles that are there twice, as walls of two sides, do not close anything.
     Crossings are transversal ones (an edge through the inside of a triangle); coincident coplanar
     triangles are not looked for.
     """
@@ -71,7 +72,14 @@ def check_surface(
             f"{source}: {int(bad.sum())} non-finite vertices (first: {int(np.argmax(bad))}); "
             "repair the mesh"
         )
-    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    single, times = np.unique(np.sort(faces, axis=1), axis=0, return_counts=True)
+    single = single[times % 2 == 1]
+    if len(single) == 0:
+        raise ValueError(
+            f"{source}: the surface is not closed: all of its triangles are there twice; give it a "
+            "thickness, or build the cage from images"
+        )
+    edges = single[:, [[0, 1], [0, 2], [1, 2]]].reshape(-1, 2)
     unique, counts = np.unique(edges, axis=0, return_counts=True)
     open_edges = counts % 2 == 1
     if open_edges.any():

@@ -23,6 +23,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, Int
 
+from nimpostor_jax.geometry.topology import adjacency
 from nimpostor_jax.preprocess.validate import boundary_faces, orient_tets, signed_volumes
 
 Log = Callable[[str], None]
@@ -153,9 +154,13 @@ def box_tets(
 
 
 def _is_sound(vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]) -> bool:
-    """No tet without volume, and a boundary that is closed and without seams of single edges."""
+    """No tet without volume, none beside another on one side of a face, a closed boundary without seams."""
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if signed_volumes(vertices, tets).min() <= 1e-10 * size**3:
+        return False
+    try:
+        adjacency(tets)
+    except ValueError:
         return False
     faces = boundary_faces(tets)
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)

@@ -145,6 +145,12 @@ def loss_gradient(
     return jax.grad(render_loss, has_aux=True)(parameters, impostor, batch, config)
 
 
+@jax.jit
+def is_finite(parameters: Any) -> Bool[Array, ""]:
+    """Whether all numbers of a pytree are finite: once one is not, training has none that is."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(parameters)]))
+
+
 def train_step(
     state: TrainState,
     impostor: NeuralImpostor,
