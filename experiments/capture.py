@@ -3,7 +3,7 @@
     python experiments/capture.py --data=DIR --workdir=out/thing --max_minutes=15
 
 DIR holds a transforms.json (instant-ngp, nerfstudio), a COLMAP model (sparse/0, images/), or images alone;
-distortion, COLMAP models and images alone need pycolmap (pip install 'nimpostor-jax[capture]'). Writes
+distortion, COLMAP models and images alone need pycolmap (pip install -e '.[capture]'). Writes
 scene/, an ordinary dataset folder with undistorted images and backgrounds, then cage.npz, then what train.py
 writes: the other scripts take --data=WORKDIR/scene. What is there already is used when it is started again.
 """

@@ -60,7 +60,9 @@ def main(argv: Sequence[str]) -> None:
 def checked_out(commit: str, folder: Path) -> Iterator[Path]:
     """A commit's files in a folder of their own."""
     git = ["git", "-C", str(ROOT), "worktree"]
-    subprocess.run([*git, "add", "--detach", str(folder), commit], check=True, capture_output=True)
+    added = subprocess.run([*git, "add", "--detach", str(folder), commit], capture_output=True, text=True)
+    if added.returncode:
+        raise ValueError(f"--base={commit}: {added.stderr.strip().splitlines()[-1]}")
     try:
         yield folder
     finally:

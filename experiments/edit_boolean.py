@@ -28,7 +28,7 @@ from nimpostor_jax.io.blender import load_scene
 from nimpostor_jax.io.images import composite, read_image, write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, orbit, write_json
+from nimpostor_jax.pipeline.evaluate import MAX_PSNR, camera_of, composite_frame, orbit, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.patterns import solid_from_image, solid_from_surface
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
@@ -75,7 +75,9 @@ def main(argv: Sequence[str]) -> None:
         images[name] = composite_frame(render_frame(impostor, camera, sized), behind)
         numbers[f"seconds_per_frame_{name}"] = time.perf_counter() - start
     if args.consolidate:
-        numbers["psnr_consolidated_to_live"] = metrics.psnr(images["consolidated"], images["live"])
+        numbers["psnr_consolidated_to_live"] = min(
+            metrics.psnr(images["consolidated"], images["live"]), MAX_PSNR
+        )
     result = list(results.values())[-1]
     save_impostor(out / "impostor.npz", result)
     save_config(config, out)  # with which other scripts render it

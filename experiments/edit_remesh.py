@@ -29,7 +29,7 @@ from nimpostor_jax.io.images import composite, write_png
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.evaluate import camera_of, composite_frame, evaluate, orbit, write_json
+from nimpostor_jax.pipeline.evaluate import MAX_PSNR, camera_of, composite_frame, evaluate, orbit, write_json
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.preprocess.cage import cage_from_images
 from nimpostor_jax.preprocess.validate import check_tets
@@ -85,7 +85,7 @@ def main(argv: Sequence[str]) -> None:
         "psnr_after": after["psnr"],
         "ssim_before": before["ssim"],
         "ssim_after": after["ssim"],
-        "psnr_to_before": metrics.psnr(*images),
+        "psnr_to_before": min(metrics.psnr(*images), MAX_PSNR),
         "tets_before": len(old.mesh.tets),
         "tets_after": len(new.mesh.tets),
         "parameters_before": int(old.tables.features.size),

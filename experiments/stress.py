@@ -77,7 +77,13 @@ def main(argv: Sequence[str]) -> None:
     parser.add_argument("--workers", type=int, default=num_cores(), help="processes")
     args = parser.parse_args(argv)
     cases = {name: make(np.random.default_rng(args.seed)) for name, make in MESHES.items()}
+    unknown = set(args.only or []) - set(cases)
+    if unknown or args.rays < 1:
+        raise ValueError(f"--only: no mesh {min(unknown)!r}" if unknown else "--rays must be >= 1")
     cases = {name: case for name, case in cases.items() if args.only is None or name in args.only}
+    twice = {path.stem for path in args.cage} & set(cases)
+    if twice or len({path.stem for path in args.cage}) < len(args.cage):
+        raise ValueError("--cage: results go by the files' names, which another mesh has, too; rename them")
     cases |= {path.stem: Case(load_tets(path), chunk=256) for path in args.cage}
     rounds = -(-args.rays // (len(TOLERANCE) * len(RAYS) * sum(case.chunk for case in cases.values())))
     jobs = list(itertools.product(cases, TOLERANCE))
@@ -103,7 +109,8 @@ def main(argv: Sequence[str]) -> None:
 def total(results: dict[str, dict[str, Row]]) -> dict[str, Any]:
     """Counts of all meshes together, and their largest errors by dtype."""
     rows = [row for by_dtype in results.values() for row in by_dtype.values()]
-    counts = {key: sum(row[key] for row in rows) for key in ("rays", "lost", "doubled", "nonfinite")}
+    names = ("rays", "lost", "doubled", "nonfinite", "overflow")
+    counts = {key: sum(row[key] for row in rows) for key in names}
     errors = {
         key: {dtype: max(by_dtype[dtype][key] for by_dtype in results.values()) for dtype in TOLERANCE}
         for key in ("max_chord_error", "color_error")

@@ -63,7 +63,7 @@ def require_pycolmap(purpose: str) -> Any:
     except ImportError as error:
         raise ValueError(
             f"{purpose} needs pycolmap, which is not installed ({error}); "
-            "pip install 'nimpostor-jax[capture]'"
+            "pip install -e '.[capture]'"
         ) from error
     return pycolmap
 

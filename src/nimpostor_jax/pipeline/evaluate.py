@@ -77,7 +77,7 @@ def evaluate(
         key: _mean([view[key] for view in per_view]) for key in ("psnr", "ssim", "lpips")
     }
     result |= {"seconds_per_frame": float(np.median(seconds)), "per_view": per_view}
-    lpips = "not installed" if result["lpips"] is None else f"{result['lpips']:.4f}"
+    lpips = "none (see metrics.lpips)" if result["lpips"] is None else f"{result['lpips']:.4f}"
     log(
         f"{len(views)} views: PSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.4f}, LPIPS {lpips}, "
         f"{result['seconds_per_frame']:.2f} s a frame"
