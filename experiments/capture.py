@@ -16,7 +16,7 @@ from train import train
 
 from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
 from nimpostor_jax.io.mesh_files import save_tets
-from nimpostor_jax.pipeline.capture import box_region, captured_cage, make_scene
+from nimpostor_jax.pipeline.capture import box_region, captured_cage, check_coarse, make_scene
 from nimpostor_jax.pipeline.prepare import use_all_cores
 from nimpostor_jax.render.sampling import with_step
 
@@ -58,6 +58,7 @@ def main(argv: Sequence[str]) -> None:
 
     use_all_cores()
     folder, region = make_scene(args.data, args.workdir, config, region)
+    check_coarse(coarse, args.workdir)
     cage = args.workdir / "cage.npz"
     if not cage.exists():
         save_tets(cage, *captured_cage(folder, region, config, coarse, args.workdir))

@@ -179,11 +179,8 @@ def captured_cage(
     cage. Raises ValueError where the field finds nothing, where that folder's fit has another configuration,
     or as in `cage_from_grid`.
     """
-    settings = workdir / "coarse" / "config.json"
-    values = json.loads(json.dumps(to_dict(coarse)))
-    if settings.exists() and json.loads(settings.read_text(encoding="utf-8")) != values:
-        raise ValueError(f"{settings.parent} has a fit with other --coarse_bindings; remove it")
-    write_json(settings, values)
+    check_coarse(coarse, workdir)
+    write_json(workdir / "coarse" / "config.json", to_dict(coarse))
     width = read_json(folder, folder / "transforms_train.json")["w"]
     train = load_blender(folder, "train", min(coarse.data.resolution or width, width))
     scene = prepare_views(coarse, train, train, box_tets(region.bounds), log)
@@ -191,6 +188,16 @@ def captured_cage(
     log(f"coarse fit: {progress.step} steps in {progress.seconds:.0f} s")
     grid = object_grid(scene, impostor, region, config.cage.grid_resolution, log)
     return cage_from_grid(grid, config.cage, log)
+
+
+def check_coarse(coarse: ExperimentConfig, workdir: Path) -> None:
+    """Raise ValueError where the coarse fit there, and the cage made from it, had another configuration."""
+    settings = workdir / "coarse" / "config.json"
+    values = json.loads(json.dumps(to_dict(coarse)))
+    if settings.exists() and json.loads(settings.read_text(encoding="utf-8")) != values:
+        raise ValueError(
+            f"{settings.parent} has a fit with other --coarse_bindings; remove it, and {workdir / 'cage.npz'}"
+        )
 
 
 def object_grid(
