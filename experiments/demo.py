@@ -12,8 +12,7 @@ import numpy as np
 
 from nimpostor_jax.edit.deform import deform, twist
 from nimpostor_jax.export.video import write_gif
-from nimpostor_jax.gin_flags import add_flags, load_config, operative_config_text, run_cli
-from nimpostor_jax.io.atomic import atomic_path
+from nimpostor_jax.gin_flags import add_flags, load_config, run_cli, save_config
 from nimpostor_jax.io.impostor_file import save_impostor
 from nimpostor_jax.pipeline.evaluate import evaluate, orbit, write_json
 from nimpostor_jax.pipeline.fit import fit
@@ -39,8 +38,7 @@ def main(argv: Sequence[str]) -> None:
     use_all_cores()
     cage = args.workdir / "cage.npz"
     scene = prepare(config, "fluffy_ball", cage=cage if cage.exists() else None, cage_output=cage)
-    with atomic_path(args.workdir / "config.gin") as path:
-        path.write_text(operative_config_text(config), encoding="utf-8")
+    save_config(config, args.workdir)
     impostor, progress = fit(scene, max_minutes=args.minutes)
     print(f"trained {progress.step} steps in {progress.seconds / 60:.1f} minutes")
     save_impostor(args.workdir / "impostor.npz", impostor)
