@@ -92,11 +92,10 @@ def test_cameras_far_from_the_origin(make_scene, rgba):
     """What float32 cannot tell apart is refused; some thousands of distances are fine."""
     folder = make_scene([rgba(64, 64), rgba(64, 64)])
     meta = read_transforms(folder, "train")
-    for camera in (tripod := copy.deepcopy(meta))["frames"]:
-        for row, value in zip(camera["transform_matrix"], (0.1, 2.3, 4.7), strict=False):
-            row[3] = value
-    tripod["frames"] = [tripod["frames"][i % 2] for i in range(7)]  # whose mean is rounded
-    write_transforms(folder, "train", tripod)
+    tripod = copy.deepcopy(meta["frames"][0])
+    for row, value in zip(tripod["transform_matrix"], (0.1, 2.3, 4.7), strict=False):
+        row[3] = value
+    write_transforms(folder, "train", {**meta, "frames": 7 * [tripod]})  # whose mean is rounded
     load_blender(folder, "train")
     for shift, fine in ((1e4, True), (1e7, False), (1e9, False)):
         moved = copy.deepcopy(meta)

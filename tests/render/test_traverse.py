@@ -329,11 +329,9 @@ def test_inverted_and_flat_tets_end_and_stay_finite(damage, rng):
 
 def test_one_flat_tet_does_not_hide_those_behind_it(rng):
     """A sliver inside the cage is walked through: the chord of the whole cage stays exact."""
-    vertices, tets = cube()
-    mesh = build_tet_mesh(vertices, tets)
-    corner = int(np.asarray(tets)[0, 1])
+    mesh = build_tet_mesh(*cube())
+    corner, *others = np.asarray(mesh.tets)[0, [1, 0, 2, 3]]
     flattened = np.asarray(mesh.vertices).copy()
-    others = [v for v in np.asarray(tets)[0] if v != corner]
     flattened[corner] = flattened[others].mean(axis=0)
     flat = mesh.replace(vertices=jnp.asarray(flattened))
     rays = generic(*local_vertices(flat), rng, COUNT)
