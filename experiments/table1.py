@@ -110,7 +110,7 @@ def main(argv: Sequence[str]) -> None:
     picture[pixels] = color + (1 - opacity)[:, None]
     pictures["ray bending (KNN)"] = picture.reshape(camera.height, camera.width, 3)
 
-    stored = Image.fromarray(to_uint8(composite(views.images[0], "white")))  # as the frames
+    stored = Image.fromarray(to_uint8(composite(views.images[0], "white")))
     truth = np.asarray(stored.resize((camera.width, camera.height), Image.Resampling.BICUBIC)) / 255
     shown = np.zeros(camera.height * camera.width, bool)
     shown[pixels] = True

@@ -1,8 +1,7 @@
 """Cells of their own for the tets that an edit changes, beside a field that stays to the last bit (Sec. 4.2).
 
 A region's tables stand behind those of the old field, level by level, and its decoders are copies of those
-that its tets had. What is
-trained is taken out and put back by index, so that nothing else can change.
+that its tets had. What is trained is taken out and put back by index, so that nothing else can change.
 
 Host code but for `trained_part` and `with_trained_part`. Axes: T tets of the mesh, C cells, D decoder sets.
 """
