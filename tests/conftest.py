@@ -66,5 +66,15 @@ def x64():
 
 
 @pytest.fixture
+def on_accelerators(monkeypatch):
+    """What accelerators compute, computed here: whole buffers at once, running sums as trees.
+
+    A function that has been traced before keeps to what it was traced for.
+    """
+    jax.devices()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+
+
+@pytest.fixture
 def rng():
     return np.random.default_rng(0)

@@ -69,6 +69,22 @@ def test_running_folds_follow_numpy(count, rng):
     assert_array_equal(running(jnp.maximum, values, -100), np.maximum.accumulate(values))
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 1000])
+def test_running_folds_follow_numpy_on_accelerators(count, rng, on_accelerators):
+    test_running_folds_follow_numpy(count, rng)
+
+
+@pytest.mark.parametrize("used", [0, 7, 10])
+def test_one_chunk_is_no_loop(used, rng):
+    """Which accelerators would stop for."""
+    shared, items = scene(rng, 10)
+    program = jax.make_jaxpr(lambda s, i, n: map_used(scale_and_pick, s, i, n, 16))(shared, items, used)
+    assert "while" not in str(program)
+    mapped = map_used(scale_and_pick, shared, items, jnp.int32(used), 16)
+    for ours, plain in zip(mapped, scale_and_pick(shared, items), strict=True):
+        assert_allclose(ours[:used], plain[:used], rtol=1e-6)  # float32, compiled and not
+
+
 @pytest.mark.parametrize("count, used", [(0, 0), (10, 10), (10, 7), (10, 0), (9, 9), (3, 2)])
 def test_items_are_packed_across_chunks(count, used, rng, monkeypatch):
     monkeypatch.setattr(chunks, "CPU_CHUNK", 4)

@@ -22,6 +22,10 @@ def default_chunk(num_items: int, on_cpu: int | None = None) -> int:
     return max(1, min(num_items, on_cpu or CPU_CHUNK) if jax.default_backend() == "cpu" else num_items)
 
 
+def _count(items: Any) -> int:
+    return jax.tree.leaves(items)[0].shape[0]
+
+
 def padded_size(num_items: int, chunk: int) -> int:
     """The next multiple of the chunk's size; at least one chunk, since a loop over none is traced too."""
     return max(1, -(-num_items // chunk)) * chunk
@@ -37,9 +41,19 @@ def _pad(x: Array, size: int) -> Array:
 
 
 def for_chunks(
-    num_used: Int[Array, ""], chunk: int, body: Callable[[Int[Array, ""], Any], Any], carry: Any
+    num_used: Int[Array, ""],
+    num_items: int,
+    chunk: int,
+    body: Callable[[Int[Array, ""], Any], Any],
+    carry: Any,
 ) -> Any:
-    """Fold `body(start, carry)` over the chunks that hold the first `num_used` items."""
+    """Fold `body(start, carry)` over the chunks that hold the first `num_used` of all items.
+
+    Where all are one chunk, as they are on accelerators, it is computed in any case: a loop would have the
+    host wait for its bound.
+    """
+    if num_items <= chunk:
+        return body(jnp.zeros((), jnp.int32), carry)
     num_chunks = (num_used + chunk - 1) // chunk
     return jax.lax.fori_loop(0, num_chunks, lambda i, carry: body(i * chunk, carry), carry)
 
@@ -60,9 +74,12 @@ ROW = 64  # items folded one after another, in all rows at once
 def running(combine: Callable[[Array, Array], Array], values: Int[Array, " M"], start: int) -> Array:
     """Each value combined with all before it, by an associative operation of which `start` is neutral.
 
-    Rows are folded, then what they come to. Two to four times faster on a CPU than `jnp.cumsum` and
-    `jax.lax.cummax`, and faster to compile.
+    On CPUs rows are folded, then what they come to: two to four times faster than `jnp.cumsum` and
+    `jax.lax.cummax`, and faster to compile. Accelerators, which would launch a kernel for each of a row's
+    items, combine as a tree.
     """
+    if jax.default_backend() != "cpu":
+        return jax.lax.associative_scan(combine, values)
     count = values.shape[0]
     rows = jnp.pad(values, (0, -count % ROW), constant_values=start).reshape(-1, ROW).T
 
@@ -99,7 +116,7 @@ def pack_where(
 
     Beyond them stand indices of any items.
     """
-    num_items = jax.tree.leaves(items)[0].shape[0]
+    num_items = _count(items)
     chunk = default_chunk(num_items)
     items = pad_items(items, chunk)
     order = jnp.arange(chunk, dtype=jnp.int32)
@@ -112,7 +129,7 @@ def pack_where(
         return put(indices, count, start + chosen), count + more
 
     none = jnp.zeros(padded_size(num_items, chunk), jnp.int32), jnp.zeros((), jnp.int32)
-    indices, count = for_chunks(num_used, chunk, body, none) if num_items else none
+    indices, count = for_chunks(num_used, num_items, chunk, body, none) if num_items else none
     return jnp.minimum(indices[:num_items], num_items - 1), count
 
 
@@ -134,7 +151,7 @@ def map_used(
     computed is 0. Differentiable in reverse mode in the floating-point leaves of `shared` and `items`: the
     backward pass computes the function again, chunk by chunk, so that nothing but its arguments is kept.
     """
-    num_items = jax.tree.leaves(items)[0].shape[0]
+    num_items = _count(items)
     if num_items == 0:  # items may index what is shared, which is then as empty
         return function(shared, items)
     chunk = chunk or default_chunk(num_items)
@@ -148,7 +165,8 @@ def _map_used(function: Callable, chunk: int, shared: Any, items: Any, num_used:
         return put(results, start, function(shared, take(items, start, chunk)))
 
     shapes = jax.eval_shape(function, shared, items)
-    return for_chunks(num_used, chunk, body, jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes))
+    empty = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    return for_chunks(num_used, _count(items), chunk, body, empty)
 
 
 def _map_used_forward(
@@ -171,7 +189,8 @@ def _map_used_backward(function: Callable, chunk: int, residuals: tuple, cotange
         return jax.tree.map(jnp.add, sums[0], of_shared), put(sums[1], start, of_part)
 
     zeros = jax.tree.map(jnp.zeros_like, (d_shared, d_items))
-    return *for_chunks(num_used, chunk, body, zeros), None
+    num_items = _count((d_items, fixed_items))
+    return *for_chunks(num_used, num_items, chunk, body, zeros), None
 
 
 # Symbolic zeros tell the rules which arguments are differentiated: the others' gradients are spared.

@@ -73,6 +73,11 @@ def test_sums_before_follow_the_loop_across_rows(counts, rng):
         assert_allclose(gradient[mine], after, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.parametrize("counts", [[], [1], [2, 1], [3, 4 * ROW, 2, 0, ROW], [1] * 9, [50] * 9])
+def test_sums_before_follow_the_loop_on_accelerators(counts, rng, on_accelerators):
+    test_sums_before_follow_the_loop_across_rows(counts, rng)
+
+
 @pytest.mark.parametrize("used", [0, 1, 2 * ROW, 5 * ROW + 7])
 def test_sums_before_follow_the_loop_across_chunks(used, rng, monkeypatch):
     monkeypatch.setattr(chunks, "CPU_CHUNK", 2 * ROW)

@@ -15,6 +15,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from rays import as_rays, generic
 from scenes import FIELD, RENDER
 
+from nimpostor_jax import chunks
 from nimpostor_jax.config import TrainConfig
 from nimpostor_jax.field.impostor import init_impostor
 from nimpostor_jax.render.camera import to_local
@@ -115,6 +116,27 @@ def test_steps_are_deterministic_and_counted():
     assert int(first.step) == 2
     for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(again), strict=True):
         assert_array_equal(a, b)
+
+
+def test_accelerators_take_the_same_step(x64, monkeypatch):
+    """They sum in another order, in whole buffers; float64, so that nothing else differs."""
+    exact = jax.tree.map(lambda x: x.astype(jnp.float64) if x.dtype == jnp.float32 else x, scene())
+    state = init_state(exact[0], OPTIMIZER, cells_per_edge=4)
+    state = dataclasses.replace(state, last_seen=state.last_seen.at[::3].set(-100))  # some cells are empty
+
+    def step():
+        take = functools.partial(train_step, config=RENDER, optimizer=OPTIMIZER, forget_after=4)
+        return jax.jit(take)(state, *exact, RATE)  # a new function, which is traced anew
+
+    here, metrics = step()
+    monkeypatch.setattr(chunks, "CPU_CHUNK", 16)
+    in_chunks, _ = step()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    there, same_metrics = step()
+    assert metrics["loss"] > 1e-3
+    for theirs in (in_chunks, there):
+        chex.assert_trees_all_close(here, theirs, rtol=1e-9, atol=1e-12)
+    chex.assert_trees_all_close(metrics, same_metrics, rtol=1e-9)
 
 
 def test_every_parameter_group_is_trained():

@@ -91,7 +91,7 @@ def _encode(
             total = sum(w[:, None] * row for w, row in zip(weights, rows, strict=True))
             return jax.lax.dynamic_update_slice(out, jnp.expand_dims(total, 0), (level, start, jnp.int32(0)))
 
-        return for_chunks(num_used, chunk, encode_chunk, out)
+        return for_chunks(num_used, len(tet_ids), chunk, encode_chunk, out)
 
     shape = (config.num_levels, tet_ids.shape[0], features.shape[1])
     zeros = jnp.zeros(shape, jnp.result_type(features, lambdas))
@@ -103,7 +103,8 @@ def _encode(
         part = jax.lax.dynamic_slice_in_dim(by_level, start, chunk, axis=1)
         return put(out, start, part.transpose(1, 0, 2).reshape(chunk, -1))
 
-    return for_chunks(num_used, chunk, join_chunk, jnp.zeros((shape[1], shape[0] * shape[2]), zeros.dtype))
+    out = jnp.zeros((shape[1], shape[0] * shape[2]), zeros.dtype)
+    return for_chunks(num_used, len(tet_ids), chunk, join_chunk, out)
 
 
 def _encode_forward(
@@ -152,7 +153,7 @@ def _encode_backward(
                 d_coordinates = put(d_coordinates, start, added)
             return d_features, d_coordinates
 
-        return for_chunks(num_used, chunk, encode_chunk, sums)
+        return for_chunks(num_used, len(tet_ids), chunk, encode_chunk, sums)
 
     d_features = None if of_features is None else jnp.zeros_like(features)
     d_coordinates = None if of_lambdas is None else jax.tree.map(jnp.zeros_like, points.coordinates)
@@ -166,7 +167,7 @@ def _encode_backward(
         _, pull = jax.vjp(coordinates, take(lambdas, start, chunk))
         return put(d_lambdas, start, *pull(take(d_coordinates, start, chunk)))
 
-    d_lambdas = for_chunks(num_used, chunk, pull_chunk, jnp.zeros_like(lambdas))
+    d_lambdas = for_chunks(num_used, len(tet_ids), chunk, pull_chunk, jnp.zeros_like(lambdas))
     return d_features, None, None, d_lambdas, None, None
 
 
@@ -190,7 +191,7 @@ def _points(
 
     shapes = jax.eval_shape(grid.prepare, tet_ids, lambdas)
     empty = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
-    return for_chunks(num_used, chunk, prepare_chunk, empty)
+    return for_chunks(num_used, len(tet_ids), chunk, prepare_chunk, empty)
 
 
 def _rows(features: Float[Array, "entries F"], entries: Int[Array, " M"]) -> Float[Array, "M F"]:

@@ -154,7 +154,8 @@ def encode_merged(
         resolution = config.resolutions[chain[-1]]
         encode_chunk = partial(_encode_chunk, tables.corner_order, nodes, resolution, items, chunk)
         shape = (len(items[0]), nodes.shape[1])
-        out = for_chunks(used, chunk, encode_chunk, jnp.zeros(shape, jnp.result_type(nodes, lambdas)))
+        out = jnp.zeros(shape, jnp.result_type(nodes, lambdas))
+        out = for_chunks(used, num_points, chunk, encode_chunk, out)
         parts.append(out[:num_points])
     if tables.finer is not None:
         count = sum(map(len, tables.chains))

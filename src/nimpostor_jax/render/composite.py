@@ -61,9 +61,9 @@ def _sum_chunks(
 ) -> Float[Array, " M"]:
     """Chunk by chunk, from the first or from the last; a chunk hands on what its last ray has gathered."""
     count = values.shape[0]
-    chunk = default_chunk(count)
+    chunk, on_cpu = default_chunk(count), jax.default_backend() == "cpu"
     values, rays = pad_items((values, rays), chunk)
-    last_start = (num_used + chunk - 1) // chunk * chunk - chunk
+    last_start = jnp.maximum(num_used - 1, 0) // chunk * chunk
 
     def body(start: Array, carry: tuple) -> tuple:
         sums, ray, total = carry
@@ -72,13 +72,13 @@ def _sum_chunks(
         part = jnp.where(start + jnp.arange(chunk) < num_used, part, 0)
         if reverse:
             part, ids = part[::-1], ids[::-1]
-        before = _sum_rows(part, ids)
+        before = _sum_rows(part, ids) if on_cpu else _sum_tree(part, ids)
         before += jnp.where((ids == ids[0]) & (ids[0] == ray), total, 0)
         sums = put(sums, start, before[::-1] if reverse else before)
         return sums, ids[-1], before[-1] + part[-1]
 
     carry = jnp.zeros_like(values), jnp.full((), -1, rays.dtype), jnp.zeros((), values.dtype)
-    return for_chunks(num_used, chunk, body, carry)[0][:count]
+    return for_chunks(num_used, count, chunk, body, carry)[0][:count]
 
 
 def _sum_rows(values: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array, " M"]:
@@ -108,6 +108,18 @@ def _sum_rows(values: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array
     return sums.T.reshape(-1)[:count]
 
 
+def _sum_tree(values: Float[Array, " M"], rays: Int[Array, " M"]) -> Float[Array, " M"]:
+    """The same in a logarithmic number of steps, as accelerators want them: each launches kernels."""
+    first = jnp.pad(rays[1:] != rays[:-1], (1, 0), constant_values=True)
+
+    def join(left: tuple, right: tuple) -> tuple:
+        (left_starts, left_sum), (starts, total) = left, right
+        return left_starts | starts, jnp.where(starts, total, left_sum + total)
+
+    _, until = jax.lax.associative_scan(join, (first, values))
+    return jnp.where(first, 0, jnp.pad(until[:-1], (1, 0)))
+
+
 def sum_by_ray(
     weights: Float[Array, " M"],
     values: Float[Array, "M C"],
@@ -129,7 +141,8 @@ def _sum_by_ray(num_rays: int, weights: Array, values: Array, rays: Array, num_u
         used = start + jnp.arange(chunk) < num_used
         return sums.at[ray].add(jnp.where(used[:, None], weight[:, None] * value, 0))
 
-    return for_chunks(num_used, chunk, add, jnp.zeros((num_rays, values.shape[1]), values.dtype))
+    sums = jnp.zeros((num_rays, values.shape[1]), values.dtype)
+    return for_chunks(num_used, len(weights), chunk, add, sums)
 
 
 def _sum_by_ray_forward(num_rays: int, *arguments: Array) -> tuple[Array, tuple]:

@@ -22,7 +22,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import default_chunk, for_chunks, packed_indices, padded_size, take
+from nimpostor_jax.chunks import default_chunk, packed_indices, padded_size, take
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry import box_tree
 from nimpostor_jax.geometry.intersect import project, ray_frame
@@ -223,7 +223,11 @@ def _march_again(
             overflow=found.overflow.at[chosen].set(overflow, mode="drop"),
         )
 
-    return for_chunks(count, tile, march, crossings) if num_rays else crossings
+    if not num_rays:
+        return crossings
+    # A loop even where all rays are one tile: mostly there are none to march again.
+    tiles = (count + tile - 1) // tile
+    return jax.lax.fori_loop(0, tiles, lambda i, found: march(i * tile, found), crossings)
 
 
 def _march_tile(

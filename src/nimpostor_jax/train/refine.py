@@ -159,11 +159,11 @@ def _write(
     into: Int[Array, " texels"], at: Int[Array, " n"], num_used: Int[Array, ""]
 ) -> Int[Array, " texels"]:
     """`into` with each position in `at` written where `at` points to; any of them where several do."""
-    chunk = default_chunk(at.size)
+    count, chunk = at.size, default_chunk(at.size)
     at, order = pad_items(at, chunk), jnp.arange(chunk, dtype=jnp.int32)
 
     def write(start: Int[Array, ""], into: Int[Array, " texels"]) -> Int[Array, " texels"]:
         here = jnp.where(start + order < num_used, take(at, start, chunk), into.size)
         return into.at[here].set(start + order, mode="drop")
 
-    return for_chunks(num_used, chunk, write, into)
+    return for_chunks(num_used, count, chunk, write, into)

@@ -40,7 +40,7 @@ def update_rows(
 
     These are all different. The others stay as they are, and so do those of which the gradient is 0.
     """
-    chunk = default_chunk(rows.size)
+    count, chunk = rows.size, default_chunk(rows.size)
     rows, gradient = pad_items((rows, gradient), chunk)
     steps = moments.steps + 1
     unbiased = [1 - b ** steps.astype(table.dtype) for b in (B1, B2)]
@@ -61,5 +61,6 @@ def update_rows(
             second.at[at].set(two, mode="drop"),
         )
 
-    table, first, second = for_chunks(num_used, chunk, update, (table, moments.first, moments.second))
+    tables = table, moments.first, moments.second
+    table, first, second = for_chunks(num_used, count, chunk, update, tables)
     return table, RowMoments(first=first, second=second, steps=steps)
