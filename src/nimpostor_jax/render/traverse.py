@@ -50,6 +50,17 @@ def _code_tables() -> tuple[np.ndarray, np.ndarray]:
 EXIT_FACES, EXIT_TRIANGLES = _code_tables()
 
 
+def _held_as() -> np.ndarray:
+    """4 f + r of the face f with the given corners in its order, or from its r-th one on; [4, 4, 4]."""
+    table = np.zeros((4, 4, 4), np.int32)
+    for face, rotation in np.ndindex(4, 3):
+        table[tuple(np.roll(FACES[face], -rotation))] = 4 * face + rotation
+    return table
+
+
+_HELD_AS = _held_as()
+
+
 @struct.dataclass
 class Entries:
     """Where each ray's line enters the cage from outside, in order along the line; a fact of mesh and ray.
@@ -106,17 +117,13 @@ def march_tables(mesh: TetMesh) -> MarchTables:
 
 def _next_holds(tets: Int[Array, "T 4"], neighbors: Int[Array, "T 4"]) -> Int[Array, " 36T"]:
     """Where each code leads: the neighbour, the face it is entered by, and the rotation of its corners."""
-    columns = []
-    rotated = np.array([[np.roll(face, -r) for r in range(3)] for face in FACES])  # [face, rotation, 3]
-    for exit_face, triangle in zip(EXIT_FACES, EXIT_TRIANGLES, strict=True):
-        neighbor = neighbors[:, exit_face]
-        other = tets[jnp.maximum(neighbor, 0)]
-        held = tets[:, triangle]  # [T, 3], in the order that the walk holds them
-        matches = jnp.all(other[:, rotated] == held[:, None, None, :], axis=-1)  # [T, face, rotation]
-        found = jnp.argmax(matches.reshape(-1, 12), axis=1)
-        column = 16 * neighbor + 4 * (found // 3) + found % 3
-        columns.append(jnp.where(neighbor >= 0, column, -1))
-    return jnp.stack(columns, axis=1).reshape(-1).astype(jnp.int32)
+    around = tets[jnp.maximum(neighbors, 0)]  # [T, 4, 4]: the corners of the tets behind the four faces
+    same = around[:, :, None, :] == tets[:, None, :, None]
+    # [T, 4, 4]: which of them each corner is. Only those that both tets have are asked for.
+    theirs = jnp.sum(jnp.where(same, jnp.arange(4), 0), axis=-1)
+    first, second, third = (theirs[:, EXIT_FACES, EXIT_TRIANGLES[:, i]] for i in range(3))
+    entered = 16 * neighbors[:, EXIT_FACES] + jnp.asarray(_HELD_AS)[first, second, third]
+    return jnp.where(neighbors[:, EXIT_FACES] >= 0, entered, -1).reshape(-1).astype(jnp.int32)
 
 
 def find_entries(tables: MarchTables, rays: Rays, config: MarchConfig) -> Entries:
