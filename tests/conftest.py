@@ -71,7 +71,7 @@ def on_accelerators(monkeypatch):
 
     A function that has been traced before keeps to what it was traced for.
     """
-    jax.devices()
+    jax.devices()  # found before the name changes
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
 
 

@@ -1,5 +1,7 @@
 """chunks: the used part of a buffer, chunk by chunk."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,6 +74,7 @@ def test_running_folds_follow_numpy(count, rng):
 @pytest.mark.parametrize("count", [0, 1, 2, 3, 1000])
 def test_running_folds_follow_numpy_on_accelerators(count, rng, on_accelerators):
     test_running_folds_follow_numpy(count, rng)
+    assert "scan" not in str(jax.make_jaxpr(lambda v: running(jnp.add, v, 0))(jnp.zeros(1000)))
 
 
 @pytest.mark.parametrize("used", [0, 7, 10])
@@ -83,6 +86,13 @@ def test_one_chunk_is_no_loop(used, rng):
     mapped = map_used(scale_and_pick, shared, items, jnp.int32(used), 16)
     for ours, plain in zip(mapped, scale_and_pick(shared, items), strict=True):
         assert_allclose(ours[:used], plain[:used], rtol=1e-6)  # float32, compiled and not
+
+    def total(values, function):
+        return jnp.sum(function(shared, (values, items[1]))[0][:used])
+
+    mapped_too = partial(map_used, scale_and_pick, num_used=jnp.int32(used), chunk=16)
+    ours, plain = (jax.grad(total)(items[0], function) for function in (mapped_too, scale_and_pick))
+    assert_allclose(ours, plain, rtol=1e-6, atol=1e-7)
 
 
 @pytest.mark.parametrize("count, used", [(0, 0), (10, 10), (10, 7), (10, 0), (9, 9), (3, 2)])

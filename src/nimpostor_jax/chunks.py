@@ -2,7 +2,8 @@
 
 Shapes are static, so a buffer has room for the worst case; a loop with a traced bound over chunks of it
 computes the rest of the chunk in which the used part ends, and nothing beyond. On a CPU a chunk's arrays
-also stay in the cache. Axis: M items, used ones first.
+also stay in the cache. A buffer that is one chunk, as all are on accelerators, is computed as a whole.
+Axis: M items, used ones first.
 """
 
 from collections.abc import Callable
@@ -27,7 +28,7 @@ def _count(items: Any) -> int:
 
 
 def padded_size(num_items: int, chunk: int) -> int:
-    """The next multiple of the chunk's size; at least one chunk, since a loop over none is traced too."""
+    """The next multiple of the chunk's size; at least one chunk, which is traced and may be computed."""
     return max(1, -(-num_items // chunk)) * chunk
 
 
@@ -147,9 +148,11 @@ def map_used(
 ) -> Any:
     """`function(shared, items)` of arrays [M, ...] in chunks, for the first `num_used` items.
 
-    `function` maps items one by one and closes over no traced value. What stands beyond the last chunk
-    computed is 0. Differentiable in reverse mode in the floating-point leaves of `shared` and `items`: the
-    backward pass computes the function again, chunk by chunk, so that nothing but its arguments is kept.
+    `function` maps items one by one and closes over no traced value; its slopes must be finite for all
+    items, since those behind the used ones may be computed too. What stands beyond the last chunk computed
+    is 0. Differentiable in reverse mode in the floating-point leaves of `shared` and `items`: the
+    backward pass computes the function again, chunk by chunk, so that nothing but its arguments is kept
+    where there are several chunks.
     """
     num_items = _count(items)
     if num_items == 0:  # items may index what is shared, which is then as empty

@@ -78,9 +78,12 @@ def test_sums_before_follow_the_loop_on_accelerators(counts, rng, on_accelerator
     test_sums_before_follow_the_loop_across_rows(counts, rng)
 
 
+@pytest.mark.parametrize("backend, chunk", [("cpu", 2 * ROW), ("cpu", 100 * ROW), ("gpu", None)])
 @pytest.mark.parametrize("used", [0, 1, 2 * ROW, 5 * ROW + 7])
-def test_sums_before_follow_the_loop_across_chunks(used, rng, monkeypatch):
-    monkeypatch.setattr(chunks, "CPU_CHUNK", 2 * ROW)
+def test_sums_before_follow_the_loop_over_what_is_used(used, backend, chunk, rng, monkeypatch):
+    """In several chunks, in one, and as accelerators take them."""
+    monkeypatch.setattr(chunks, "CPU_CHUNK", chunk)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     rays = packed_rays([40, 3 * ROW, 1, 2 * ROW, 200])[: 5 * ROW + 7]
     values, mix = rng.uniform(0, 1, (2, len(rays))).astype(np.float32)
     sums = sum_before(values, rays, jnp.int32(used))
@@ -91,6 +94,7 @@ def test_sums_before_follow_the_loop_across_chunks(used, rng, monkeypatch):
         after = np.cumsum(mix[mine][::-1], dtype=np.float64)[::-1] - mix[mine]
         assert_allclose(sums[mine], before, rtol=1e-5, atol=1e-6)
         assert_allclose(gradient[mine], after, rtol=1e-5, atol=1e-6)
+    assert_array_equal(gradient[used:], 0)
 
 
 def test_sums_by_ray_and_their_gradients(rng, x64, monkeypatch):
