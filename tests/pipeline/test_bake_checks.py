@@ -1,6 +1,7 @@
 """pipeline.bake: what is refused before long work, and which tets are left."""
 
 import dataclasses
+import re
 
 import jax
 import numpy as np
@@ -11,7 +12,7 @@ from scenes import constant_density
 
 from nimpostor_jax.config import BakeConfig, TrainConfig
 from nimpostor_jax.edit.subdivide import subdivide
-from nimpostor_jax.pipeline.bake import bake, checked_texels, face_pixels, only_tets, refine
+from nimpostor_jax.pipeline.bake import bake, checked_resolutions, face_pixels, only_tets, refine
 from nimpostor_jax.pipeline.prepare import prepare
 from nimpostor_jax.render.frame import render_frame
 from nimpostor_jax.train.pool import build_pool
@@ -36,9 +37,17 @@ def test_lengths_are_in_pixels():
 
 
 def test_textures_that_need_too_much_memory_are_refused():
-    resolutions = np.full((1000, 4), 60)
-    with pytest.raises(ValueError, match=r"need 4\d\d MB, more than BakeConfig.max_megabytes = 100"):
-        checked_texels(resolutions, 14, BakeConfig(max_megabytes=100), print)
+    """With the texels that would fit, where some would."""
+    pixels, config = np.full((1000, 4), 85.0), BakeConfig(texels_per_pixel=0.7, max_megabytes=100)
+    refused = r"need 4\d\d MB, more than BakeConfig.max_megabytes = 100"
+    with pytest.raises(ValueError, match=refused) as caught:
+        checked_resolutions(pixels, 14, config, print)
+    coarser = float(re.search(r"texels_per_pixel=([\d.]+) would fit", str(caught.value))[1])
+    fitting = dataclasses.replace(config, texels_per_pixel=coarser)
+    assert 0.25 < coarser < 0.4  # half the texels along an edge need a quarter of the memory
+    assert np.all(checked_resolutions(pixels, 14, fitting, print) == np.ceil(85 * coarser))
+    with pytest.raises(ValueError, match=r"= 1; raise BakeConfig.tet_pixels, or raise the limit"):
+        checked_resolutions(pixels, 140, dataclasses.replace(config, max_megabytes=1), print)
 
 
 def test_an_impostor_that_shows_nothing_is_refused(config, cage):

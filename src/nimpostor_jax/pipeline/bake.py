@@ -70,11 +70,10 @@ def bake(impostor: NeuralImpostor, scene: Scene, config: BakeConfig, *, log: Log
     part, seen = visible_part(impostor, scene.train, render, config, log=log)
     mesh = part.mesh
     pixels = face_pixels(world_vertices(mesh), np.asarray(mesh.tets), scene.train)
-    resolutions = np.ceil(config.texels_per_pixel * pixels).astype(np.int64)
-    resolutions = np.clip(resolutions, 1, config.max_resolution)
     decoders, layers = principal_channels(impostor.decoders, np.asarray(seen.products), config.channels)
     num_channels = layers[0]["weight"].shape[2]
-    counts = checked_texels(resolutions, BASIS * (2 + num_channels), config, log)
+    resolutions = checked_resolutions(pixels, BASIS * (2 + num_channels), config, log)
+    counts = num_texels(resolutions).reshape(-1)
     faces = np.repeat(np.arange(counts.size), counts)
     layout = build_face_layout(resolutions)
     ready = for_frames(impostor)
@@ -184,7 +183,14 @@ def visible_part(
         seen = rays.add_up(partial(nothing_seen, impostor), add_seen, 1.0, "look", impostor)
         log_lost(int(seen.lost) / count, log)
         visible = np.asarray(seen.taken > config.min_opacity * np.maximum(seen.light, 1))
-        log(f"something is seen in {visible.sum():,} of {len(visible):,} tets")
+        # An eighth of each tet after a halving, with edges half as long, as long as something is seen in all
+        pixels = face_pixels(world_vertices(impostor.mesh), np.asarray(impostor.mesh.tets), views)[visible]
+        left, numbers = halvings - i, BASIS * (2 + config.channels)
+        megabytes = 8**left * _megabytes(_resolutions(pixels / 2**left, config), numbers)
+        log(
+            f"something is seen in {visible.sum():,} of {len(visible):,} tets: textures of about "
+            f"{megabytes:.0f} MB at most"
+        )
         if not visible.any():
             raise ValueError("nothing is seen in any tet; train the impostor before it is baked")
         if i < halvings:
@@ -219,22 +225,41 @@ def fit_config(
     return fit_capacities(mesh, tables, probe.rays, config, embedding=impostor.embedding)
 
 
-def checked_texels(
-    resolutions: Int[np.ndarray, "U 4"], numbers: int, config: BakeConfig, log: Log
-) -> Int[np.ndarray, " 4U"]:
-    """Texels of each face. Raises ValueError where all, of so many numbers each, need too much memory."""
-    counts = num_texels(resolutions).reshape(-1)
-    megabytes = counts.sum() * numbers * 4 / 1e6
+def checked_resolutions(
+    pixels: Float[np.ndarray, "U 4"], numbers: int, config: BakeConfig, log: Log
+) -> Int[np.ndarray, "U 4"]:
+    """Texels along an edge of faces of so many pixels. Raises ValueError where all texels, of so many numbers
+    each, need too much memory, and says what would not.
+    """
+    resolutions = _resolutions(pixels, config)
+    megabytes = _megabytes(resolutions, numbers)
     log(
         f"{len(resolutions):,} tets with textures of at most {resolutions.max()} texels along an edge; "
-        f"{counts.sum():,} texels: {megabytes:.0f} MB"
+        f"{num_texels(resolutions).sum():,} texels: {megabytes:.0f} MB"
     )
     if megabytes > config.max_megabytes:
+
+        def fits(texels_per_pixel: float) -> bool:
+            coarser = dataclasses.replace(config, texels_per_pixel=texels_per_pixel)
+            return _megabytes(_resolutions(pixels, coarser), numbers) <= config.max_megabytes
+
+        tried = (float(f"{0.9**i * config.texels_per_pixel:.3g}") for i in range(1, 40))
+        value = next(filter(fits, tried), None)
+        remedy = f"BakeConfig.texels_per_pixel={value} would fit" if value else "raise BakeConfig.tet_pixels"
         raise ValueError(
             f"the textures need {megabytes:.0f} MB, more than BakeConfig.max_megabytes = "
-            f"{config.max_megabytes}; lower BakeConfig.texels_per_pixel or raise the limit"
+            f"{config.max_megabytes}; {remedy}, or raise the limit"
         )
-    return counts
+    return resolutions
+
+
+def _resolutions(pixels: Float[np.ndarray, "U 4"], config: BakeConfig) -> Int[np.ndarray, "U 4"]:
+    texels = np.ceil(config.texels_per_pixel * pixels).astype(np.int64)
+    return np.clip(texels, 1, config.max_resolution)
+
+
+def _megabytes(resolutions: Int[np.ndarray, "U 4"], numbers: int) -> float:
+    return float(num_texels(resolutions).sum() * numbers * 4 / 1e6)
 
 
 def refine(
