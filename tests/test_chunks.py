@@ -78,8 +78,8 @@ def test_running_folds_follow_numpy_on_accelerators(count, rng, on_accelerators)
 
 
 @pytest.mark.parametrize("used", [0, 7, 10])
-def test_one_chunk_is_no_loop(used, rng):
-    """Which accelerators would stop for."""
+def test_one_chunk_is_no_loop_on_accelerators(used, rng, on_accelerators):
+    """Which they would stop for."""
     shared, items = scene(rng, 10)
     program = jax.make_jaxpr(lambda s, i, n: map_used(scale_and_pick, s, i, n, 16))(shared, items, used)
     assert "while" not in str(program)

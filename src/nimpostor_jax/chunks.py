@@ -2,7 +2,7 @@
 
 Shapes are static, so a buffer has room for the worst case; a loop with a traced bound over chunks of it
 computes the rest of the chunk in which the used part ends, and nothing beyond. On a CPU a chunk's arrays
-also stay in the cache. A buffer that is one chunk, as all are on accelerators, is computed as a whole.
+also stay in the cache. On accelerators all buffers are one chunk, which is computed as a whole.
 Axis: M items, used ones first.
 """
 
@@ -50,10 +50,10 @@ def for_chunks(
 ) -> Any:
     """Fold `body(start, carry)` over the chunks that hold the first `num_used` of all items.
 
-    Where all are one chunk, as they are on accelerators, it is computed in any case: a loop would have the
+    Where all are one chunk, as they are on accelerators, these compute it in any case: a loop would have the
     host wait for its bound.
     """
-    if num_items <= chunk:
+    if num_items <= chunk and jax.default_backend() != "cpu":
         return body(jnp.zeros((), jnp.int32), carry)
     num_chunks = (num_used + chunk - 1) // chunk
     return jax.lax.fori_loop(0, num_chunks, lambda i, carry: body(i * chunk, carry), carry)
@@ -152,7 +152,7 @@ def map_used(
     items, since those behind the used ones may be computed too. What stands beyond the last chunk computed
     is 0. Differentiable in reverse mode in the floating-point leaves of `shared` and `items`: the
     backward pass computes the function again, chunk by chunk, so that nothing but its arguments is kept
-    where there are several chunks.
+    on CPUs.
     """
     num_items = _count(items)
     if num_items == 0:  # items may index what is shared, which is then as empty
