@@ -1,17 +1,22 @@
-"""Entries and walks where faces have no area, tets are inverted, or the boundary has many faces."""
+"""Entries and walks where faces have no area, tets are inverted, tests are close, or there are many faces."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from meshes import grid, local_vertices, tet_mesh
-from numpy.testing import assert_array_equal
-from rays import DEGENERATE, GENERIC, as_rays, by_ray
+from numpy.testing import assert_allclose, assert_array_equal
+from rays import DEGENERATE, GENERIC, as_rays, by_ray, unit
 
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry.tetrahedron import num_inverted
 from nimpostor_jax.geometry.topology import build_tet_mesh
 from nimpostor_jax.render import capacity, entries
+from nimpostor_jax.render import traverse as traversal
+from nimpostor_jax.render.camera import to_local
+from nimpostor_jax.render.entries import mended
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import find_entries, march_tables, traverse
 
@@ -111,6 +116,43 @@ def test_a_ray_that_is_no_number_leaves_its_neighbours_alone(rng):
     others = np.arange(16) != 3
     assert np.any(expected.holds[others] >= 0)
     assert_array_equal(found.holds[others], expected.holds[others])
+
+
+def test_an_edge_that_points_to_the_camera_needs_no_care(rng, monkeypatch):
+    """All rays meet its line, at the camera: tests of it are ties that decide nothing."""
+    mesh = build_tet_mesh(*grid(np.ones((2, 2, 2), bool)))
+    eye = np.array([1.0, 1.0, 6.0])  # above the edges at the middle of the grid
+    targets = rng.uniform(0, 2, (COUNT, 3))
+    rays = to_local(mesh, as_rays((np.tile(eye, (COUNT, 1)), unit(targets - eye))))
+    tables, doubts, codes = march_tables(mesh), [], []
+    for everywhere in (False, True):
+
+        def watched(doubt, careful, quick, everywhere=everywhere):
+            jax.debug.callback(lambda count: doubts.append(int(count)), doubt.sum())
+            return mended(doubt | everywhere, careful, quick)
+
+        monkeypatch.setattr(traversal, "mended", watched)
+        codes.append(traverse(tables, rays, CONFIG).codes)
+    jax.effects_barrier()
+    assert sum(doubts) <= 2 * COUNT // 10  # in both marches; half of the rays, if ties counted
+    assert_array_equal(*codes)
+
+
+@pytest.mark.parametrize("name", ["cube", "nonconvex"])
+def test_accelerators_find_the_same_crossings(name, rng, on_accelerators):
+    """All rays in one tile, whose careful tests are computed without a branch."""
+    mesh = tet_mesh(name)
+    kinds = [make(*local_vertices(mesh), rng, COUNT) for make in (GENERIC | DEGENERATE).values()]
+    rays = as_rays(tuple(np.concatenate(parts) for parts in zip(*kinds, strict=True)))
+    config = dataclasses.replace(CONFIG, tile_size=None)
+    there = jax.jit(lambda: traverse(march_tables(mesh), rays, config))()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax, "default_backend", lambda: "cpu")
+        here = jax.jit(lambda: traverse(march_tables(mesh), rays, config))()
+    assert_array_equal(there.codes, here.codes)
+    assert_array_equal(there.overflow, here.overflow)
+    # Sums of products that are fused or not, of numbers up to 4; a few times that where a face is edge-on.
+    assert_allclose(np.stack(there.ends), np.stack(here.ends), atol=1e-5)
 
 
 def test_more_entries_than_any_buffer_are_an_error(monkeypatch):

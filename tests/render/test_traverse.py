@@ -14,8 +14,6 @@ from rays import DEGENERATE, GENERIC, as_rays, by_ray, generic, unit
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry.tetrahedron import num_inverted
 from nimpostor_jax.geometry.topology import build_tet_mesh
-from nimpostor_jax.render import traverse as traversal
-from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.segments import locate_segments
 from nimpostor_jax.render.traverse import march_tables, traverse
 
@@ -252,26 +250,6 @@ def test_results_do_not_depend_on_the_tile(tile, rng):
     codes, overflow = crossings(mesh, rays, tile_size=tile)
     assert_array_equal(codes, expected)
     assert not overflow.any()
-
-
-def test_an_edge_that_points_to_the_camera_needs_no_care(rng, monkeypatch):
-    """All rays meet its line, at the camera: tests of it are ties that decide nothing."""
-    mesh = build_tet_mesh(*grid(np.ones((2, 2, 2), bool)))
-    eye = np.array([1.0, 1.0, 6.0])  # above the edges at the middle of the grid
-    targets = rng.uniform(0, 2, (COUNT, 3))
-    rays = to_local(mesh, as_rays((np.tile(eye, (COUNT, 1)), unit(targets - eye))))
-    tables, seen = march_tables(mesh), []
-    again = traversal._march_again
-
-    def watched(tables, rays, config, found, unsure, tile):
-        seen.append((found.codes, np.asarray(unsure)))
-        return again(tables, rays, config, found, jnp.ones_like(unsure), tile)
-
-    monkeypatch.setattr(traversal, "_march_again", watched)
-    careful = traverse(tables, rays, CONFIG).codes
-    ((quick, unsure),) = seen
-    assert unsure.sum() <= COUNT // 10  # half of them, if ties counted
-    assert_array_equal(quick[:, ~unsure], careful[:, ~unsure])
 
 
 def test_no_rays_give_no_segments():

@@ -7,8 +7,9 @@ ray descends a tree of boxes on its own, whose leaves the clusters are.
 Axes: B entries, T tets; rays are lanes, the last axis.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,68 +44,82 @@ class MarchTables:
     node_high: Float[Array, "nodes 3"]
 
 
-def sides(edges: Iterable[tuple], careful: bool) -> tuple[list[Array], list[Array]]:
-    """`passes_left` of each edge, and where that may be wrong."""
-    if careful:
-        sides = [passes_left(*edge) for edge in edges]
-        return sides, [jnp.zeros_like(side) for side in sides]
-    quick = [quick_passes_left(*edge) for edge in edges]
-    return [left for left, _ in quick], [close for _, close in quick]
+Points = Sequence[tuple[Array, ...]]
+
+
+def mended(doubt: Bool[Array, " lanes"], careful: Callable[[], Any], quick: Any) -> Any:
+    """What was found quickly, and in lanes of doubt what is found with care: they are rare, and care is dear.
+
+    Accelerators compute both, since a branch would have the host wait.
+    """
+
+    def mend() -> Any:
+        return jax.tree.map(partial(jnp.where, doubt), careful(), quick)
+
+    return jax.lax.cond(jnp.any(doubt), mend, lambda: quick) if jax.default_backend() == "cpu" else mend()
+
+
+def careful_sides(starts: Points, ends: Points) -> list[Bool[Array, " lanes"]]:
+    """`passes_left` of each edge; stacked, as it is seldom asked for and would be compiled once for each."""
+    u, v = ([jnp.stack([point[i] for point in points]) for i in range(2)] for points in (starts, ends))
+    return list(passes_left(u, v))
 
 
 def met_at(
-    a: Sequence[Array], b: Sequence[Array], c: Sequence[Array], careful: bool
-) -> tuple[tuple[Float[Array, " lanes"], ...], Bool[Array, " lanes"]]:
-    """t at which the line meets a projected triangle, the weights of its first two corners, and doubt."""
-    if careful:
-        (wa, wb, wc), flat = face_weights(a, b, c), jnp.zeros(a[0].shape, bool)
-    else:
-        (wa, wb, wc), flat = quick_face_weights(a, b, c)
-    return (wa * a[2] + wb * b[2] + wc * c[2], wa, wb), flat
+    a: Sequence[Array], b: Sequence[Array], c: Sequence[Array], asked: Bool[Array, " lanes"]
+) -> tuple[Float[Array, " lanes"], ...]:
+    """t at which the line meets a projected triangle, and the weights of its first two corners.
+
+    Lanes that are not asked for may have any numbers.
+    """
+    quick, flat = quick_face_weights(a, b, c)
+    wa, wb, wc = mended(asked & flat, lambda: face_weights(a, b, c), quick)
+    return wa * a[2] + wb * b[2] + wc * c[2], wa, wb
 
 
 def search_entries(
-    tables: MarchTables, config: MarchConfig, careful: bool, origin: tuple, axes: tuple
-) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"], Bool[Array, " lanes"]]:
-    """The front-facing boundary faces on each lane's line by t: their holds (-1 pads), count, and doubt."""
+    tables: MarchTables, config: MarchConfig, origin: tuple, axes: tuple
+) -> tuple[Int[Array, "B lanes"], Int[Array, " lanes"]]:
+    """The front-facing boundary faces on each lane's line by t: their holds (-1 pads), and count."""
     lanes, slots = origin[0].shape[0], config.max_entries_per_ray
     dtype = origin[0].dtype
 
-    def test_face(corners: Sequence[tuple], hold: Int[Array, "*lanes"], unsure: Array, found: tuple) -> tuple:
+    def test_face(corners: Sequence[tuple], hold: Int[Array, "*lanes"], found: tuple) -> tuple:
         a, b, c = (project(corner, origin, axes) for corner in corners)
         # Counter-clockwise from outside is clockwise along a ray that comes from outside.
-        left, close = sides(((a, b), (b, c), (c, a)), careful)
-        hit, possible = (hold >= 0) & ~left[0] & ~left[1] & ~left[2], hold >= 0
-        hit &= (a[0] != b[0]) | (a[1] != b[1])  # seen as a point, a face has no left and right
-        for passed, doubt in zip(left, close, strict=True):
-            possible &= ~passed | doubt
-        unsure |= possible & (close[0] | close[1] | close[2])
+        tests = [quick_passes_left(*edge) for edge in ((a, b), (b, c), (c, a))]
+        quick, close = zip(*tests, strict=True)
+        possible = (hold >= 0) & ((a[0] != b[0]) | (a[1] != b[1]))  # a point has no left and right
+        for left, tie in tests:
+            possible &= ~left | tie
 
         def insert() -> tuple:
-            met, flat = met_at(a, b, c, careful)
-            return unsure | (hit & flat), _insert(found, jnp.where(hit, met[0], jnp.inf), hold)
+            doubt = possible & (close[0] | close[1] | close[2])
+            left = mended(doubt, lambda: careful_sides((a, b, c), (b, c, a)), list(quick))
+            hit = possible & ~left[0] & ~left[1] & ~left[2]
+            return _insert(found, jnp.where(hit, met_at(a, b, c, hit)[0], jnp.inf), hold)
 
-        return jax.lax.cond(jnp.any(hit), insert, lambda: (unsure, found))
+        return jax.lax.cond(jnp.any(possible), insert, lambda: found)
 
     empty = (
         jnp.full((slots, lanes), jnp.inf, dtype),
         jnp.full((slots, lanes), -1, jnp.int32),
         jnp.zeros(lanes, jnp.int32),
     )
-    start, clusters = (jnp.zeros(lanes, bool), empty), tables.face_holds.shape[0]
+    clusters = tables.face_holds.shape[0]
 
     def by_lanes() -> tuple:
-        return _entries_of_lanes(tables, origin, axes, test_face, start)
+        return _entries_of_lanes(tables, origin, axes, test_face, empty)
 
     if clusters > MAX_FLAGGED:
         found = by_lanes()
     else:
         near = _near_clusters(tables, origin, axes[2])
-        by_tile = partial(_entries_of_tile, tables, near, test_face, start)
+        by_tile = partial(_entries_of_tile, tables, near, test_face, empty)
         few = jnp.sum(near) <= MAX_CULLED
         found = by_tile() if clusters <= MAX_CULLED else jax.lax.cond(few, by_tile, by_lanes)
-    unsure, (_, holds, count) = found
-    return holds, count, unsure
+    _, holds, count = found
+    return holds, count
 
 
 def _entries_of_tile(
@@ -117,7 +132,7 @@ def _entries_of_tile(
     def test_cluster(cluster: Int[Array, ""], found: tuple) -> tuple:
         def test(i: Int[Array, ""], found: tuple) -> tuple:
             corners = [tuple(corner) for corner in tables.face_corners[cluster, i]]
-            return test_face(corners, tables.face_holds[cluster, i], *found)
+            return test_face(corners, tables.face_holds[cluster, i], found)
 
         return jax.lax.fori_loop(0, width, test, found)
 
@@ -178,7 +193,7 @@ def _entries_of_lanes(
             face = tables.face_corners[:, i].reshape(clusters, 9)
             corners = [tuple(face[cluster, 3 * j + k] for k in range(3)) for j in range(3)]
             hold = jnp.where(ready, tables.face_holds[cluster, i], -1)
-            found = test_face(corners, hold, *found)
+            found = test_face(corners, hold, found)
         after = box_tree.skip(node)
         return jnp.where(ready & (after > 1), after, 0), found
 

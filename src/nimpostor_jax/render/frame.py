@@ -233,12 +233,8 @@ class View:
         else:
             entries = ray_entries(self._impostor.mesh, self._tables, rays, config.march)
             entries = jax.tree.map(np.asarray, entries)
-        entries = dataclasses.replace(
-            entries,
-            holds=np.where(used[:, None], entries.holds, -1),
-            overflow=entries.overflow & used,
-            unsure=entries.unsure & used,
-        )
+        holds = np.where(used[:, None], entries.holds, -1)
+        entries = dataclasses.replace(entries, holds=holds, overflow=entries.overflow & used)
         refinements = np.full(chunk, refinement, rays.origins.dtype)
         placed = jax.device_put((rays, entries, refinements), self._by_ray)
         return _render_sharded(*self._replicas, *placed, config)

@@ -14,7 +14,6 @@ Nothing here is differentiable; `segments.locate_segments` makes differentiable 
 """
 
 from functools import partial
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,16 +21,14 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int
 
-from nimpostor_jax.chunks import default_chunk, packed_indices, padded_size, take
 from nimpostor_jax.config import MarchConfig
 from nimpostor_jax.geometry import box_tree
-from nimpostor_jax.geometry.intersect import project, ray_frame
+from nimpostor_jax.geometry.intersect import project, quick_passes_left, ray_frame
 from nimpostor_jax.geometry.tetrahedron import FACES
-from nimpostor_jax.render.entries import MarchTables, met_at, search_entries, sides
+from nimpostor_jax.render.entries import MarchTables, careful_sides, mended, met_at, search_entries
 from nimpostor_jax.types import Rays, TetMesh
 
 CPU_TILE = 256  # an image tile: a larger one has a wider cone and waits longer for its last ray
-CPU_CAREFUL_TILE = 16  # of the few rays that are marched again
 CODES_PER_TET = 36
 
 
@@ -70,7 +67,6 @@ class Entries:
 
     holds: Int[Array, "R B"]  # 4 * (4 tet + f) of the boundary face; -1 pads
     overflow: Bool[Array, " R"]  # more entries than slots
-    unsure: Bool[Array, " R"]  # tests were too close for the quick way: march with care
 
 
 Point = tuple[Float[Array, " lanes"], ...]
@@ -130,14 +126,8 @@ def find_entries(tables: MarchTables, rays: Rays, config: MarchConfig) -> Entrie
     """The front-facing boundary faces on the line of each ray; rays [R] in the mesh's own frame."""
     tiles = _Tiles(rays.origins.shape[0], config)
     lines = tuple(map(tiles.split, (rays.origins, rays.directions)))
-    holds, count, unsure = jax.lax.map(
-        lambda line: search_entries(tables, config, False, *_frame(*line)), lines
-    )
-    return Entries(
-        holds=tiles.join(holds),
-        overflow=tiles.join(count) > config.max_entries_per_ray,
-        unsure=tiles.join(unsure),
-    )
+    holds, count = jax.lax.map(lambda line: search_entries(tables, config, *_frame(*line)), lines)
+    return Entries(holds=tiles.join(holds), overflow=tiles.join(count) > config.max_entries_per_ray)
 
 
 def traverse(
@@ -156,27 +146,20 @@ def traverse(
     num_tiles = parts[0].shape[0]
 
     def march(tile: Int[Array, ""], found: tuple) -> tuple:
-        rows, overflow, unsure = found
+        rows, overflow = found
         line = [jax.lax.dynamic_index_in_dim(x, tile, keepdims=False) for x in parts]
         column = tile * tiles.size
-        rows, full, doubt = _march_tile(tables, config, False, line[0], line[1], line[2], rows, column)
-        overflow = jax.lax.dynamic_update_slice(overflow, full, (column,))
-        return rows, overflow, jax.lax.dynamic_update_slice(unsure, doubt, (column,))
+        rows, full = _march_tile(tables, config, line[0], line[1], line[2], rows, column)
+        return rows, jax.lax.dynamic_update_slice(overflow, full, (column,))
 
     # Tiles write into the rays' own columns: nothing is stacked, and nothing transposed.
-    none = jnp.zeros(num_tiles * tiles.size, bool)
-    found = (_empty_rows(slots, num_tiles * tiles.size, rays.origins.dtype), none, none)
+    lanes, dtype = num_tiles * tiles.size, rays.origins.dtype
+    rows = jnp.full((slots, lanes), -1, jnp.int32), tuple(jnp.zeros((slots, lanes), dtype) for _ in range(6))
+    found = (rows, jnp.zeros(lanes, bool))
     if num_tiles:  # a loop over none is traced too, and would read the first tile
         found = jax.lax.fori_loop(0, num_tiles, march, found)
-    rows, overflow, unsure = jax.tree.map(lambda x: x[..., : tiles.num_rays], found)
-    crossings = Crossings(codes=rows[0], ends=rows[1], overflow=overflow | entries.overflow)
-    tile = default_chunk(tiles.size, CPU_CAREFUL_TILE)
-    return _march_again(tables, rays, config, crossings, unsure | entries.unsure, tile)
-
-
-def _empty_rows(slots: int, lanes: int, dtype: Any) -> tuple[Int[Array, "K lanes"], Ends]:
-    """Codes and ends before the march."""
-    return jnp.full((slots, lanes), -1, jnp.int32), tuple(jnp.zeros((slots, lanes), dtype) for _ in range(6))
+    (codes, ends), overflow = jax.tree.map(lambda x: x[..., : tiles.num_rays], found)
+    return Crossings(codes=codes, ends=ends, overflow=overflow | entries.overflow)
 
 
 class _Tiles:
@@ -198,57 +181,16 @@ class _Tiles:
         return lanes_second.reshape(-1, *lanes_second.shape[2:])[: self.num_rays]
 
 
-def _march_again(
-    tables: MarchTables,
-    rays: Rays,
-    config: MarchConfig,
-    crossings: Crossings,
-    unsure: Bool[Array, " R"],
-    tile: int,
-) -> Crossings:
-    """The crossings, with those of unsure rays from careful marches: rare, and several times slower."""
-    num_rays = unsure.shape[0]
-    lines = jax.lax.stop_gradient((rays.origins, rays.directions))
-    indices, count = packed_indices(unsure)
-    again = jnp.where(jnp.arange(num_rays) < count, indices, num_rays)
-    again = jnp.pad(again, (0, padded_size(num_rays, tile) - num_rays), constant_values=num_rays)
-
-    def march(start: Array, found: Crossings) -> Crossings:
-        chosen = take(again, start, tile)
-        # Past the end: the tile's first ray once more, so that its cone stays narrow; nothing is written.
-        read = jnp.where(chosen < num_rays, chosen, chosen[0])
-        origins, directions = (x[read].T for x in lines)
-        holds, count, _ = search_entries(tables, config, True, *_frame(origins, directions))
-        rows = _empty_rows(config.max_tets_per_ray, tile, origins.dtype)
-        (codes, ends), overflow, _ = _march_tile(tables, config, True, origins, directions, holds, rows, 0)
-        overflow |= count > config.max_entries_per_ray
-        return Crossings(
-            codes=found.codes.at[:, chosen].set(codes, mode="drop"),
-            ends=tuple(
-                old.at[:, chosen].set(new, mode="drop") for old, new in zip(found.ends, ends, strict=True)
-            ),
-            overflow=found.overflow.at[chosen].set(overflow, mode="drop"),
-        )
-
-    if not num_rays:
-        return crossings
-    # A loop even where all rays are one tile: mostly there are none to march again.
-    tiles = (count + tile - 1) // tile
-    return jax.lax.fori_loop(0, tiles, lambda i, found: march(i * tile, found), crossings)
-
-
 def _march_tile(
     tables: MarchTables,
     config: MarchConfig,
-    careful: bool,
     origins: Float[Array, "3 lanes"],
     directions: Float[Array, "3 lanes"],
     entry_holds: Int[Array, "B lanes"],
     rows: tuple[Int[Array, "K R"], Ends],
-    column: Int[Array, ""] | int,
-) -> tuple[tuple[Int[Array, "K R"], Ends], Bool[Array, " lanes"], Bool[Array, " lanes"]]:
-    """Codes and ends with this tile's written from `column` on; overflow; and the lanes on which tests were
-    too close for the quick way.
+    column: Int[Array, ""],
+) -> tuple[tuple[Int[Array, "K R"], Ends], Bool[Array, " lanes"]]:
+    """Codes and ends with this tile's written from `column` on, and overflow.
 
     The next vertex is projected at the end of each step and carried into the next: XLA compiles a kernel
     for each of a step's results, and each would repeat a projection that is not carried. For the same reason
@@ -261,67 +203,67 @@ def _march_tile(
     def corner(column: Int[Array, " lanes"]) -> Point:
         return project([row[column] for row in tables.corners], origin, axes)
 
-    def held_triangle(hold: Int[Array, " lanes"]) -> tuple[tuple[Point, Point, Point], Point]:
-        """The face that is entered, projected from scratch (at the cage's boundary), and where it is met.
-
-        Whether it is seen edge-on has been noted when it was found.
-        """
-        face = hold >> 2
-        held = jnp.asarray(FACES, jnp.int32)[face & 3]  # boundary faces are held unrotated
-        a, b, c = (corner((face & ~3) + held[:, j]) for j in range(3))
-        met, _ = met_at(a, b, c, careful)
-        return (a, b, c), met
+    def enter(hold: Int[Array, " lanes"], enters: Bool[Array, " lanes"], held: tuple) -> tuple:
+        """The triangle held by lanes that enter the cage, projected from scratch, and where it is met."""
+        face = jnp.maximum(hold, 0) >> 2
+        corners = jnp.asarray(FACES, jnp.int32)[face & 3]  # boundary faces are held unrotated
+        a, b, c = (corner((face & ~3) + corners[:, j]) for j in range(3))
+        return jax.tree.map(partial(jnp.where, enters), ((a, b, c), met_at(a, b, c, enters)), held)
 
     def unfinished(state: tuple) -> Bool[Array, ""]:
         return (state[0] < slots) & jnp.any(state[1] >= 0)
 
     def step(state: tuple) -> tuple:
-        slot, hold, new, (a, b, c), met, entry, rows, unsure = state
+        slot, hold, new, enters, held, entry, rows = state
         active = hold >= 0
-        left, close = sides([(new, a), (new, b), (new, c)], careful)
-        # The way out is the new vertex's triangle around the ray: right of one held corner, left of the next.
-        # If rounding leaves none (a sliver seen edge-on), any other face than the entry advances.
-        exit_slot = jnp.where(~left[1] & left[2], 0, jnp.where(~left[2] & left[0], 1, 2))
-        code = jnp.where(active, 9 * (hold >> 2) + 3 * (hold & 3) + exit_slot, -1)
-        first = _choose(exit_slot, b, c, a)
-        second = _choose(exit_slot, c, a, b)
-        met_after, flat = met_at(new, first, second, careful)
+        held = jax.lax.cond(jnp.any(enters), lambda: enter(hold, enters, held), lambda: held)
+        (a, b, c), met = held
+        tests = [quick_passes_left(new, point) for point in (a, b, c)]
+        left, close = zip(*tests, strict=True)
+        exit_slot = _way_out(*left)
         # Two tests decide. The third may be close, as that of an edge that points to the camera is.
         third = (exit_slot == 2) & left[1] & ~left[0]
         doubt = (close[0] & (exit_slot != 0)) | (close[1] & (exit_slot != 1)) | (close[2] & ~third)
-        unsure |= active & (doubt | flat)
+        careful = partial(careful_sides, (new, new, new), (a, b, c))
+        exit_slot = mended(active & doubt, lambda: _way_out(*careful()), exit_slot)
+        code = jnp.where(active, 9 * (hold >> 2) + 3 * (hold & 3) + exit_slot, -1)
+        first = _choose(exit_slot, b, c, a)
+        second = _choose(exit_slot, c, a, b)
+        met_after = met_at(new, first, second, active)
         values = code, (*met, *met_after)
         rows = jax.tree.map(
             lambda row, value: jax.lax.dynamic_update_slice(row, value[None], (slot, column)), rows, values
         )
 
         hold = jnp.where(active, tables.next_holds[jnp.maximum(code, 0)], -1)
-        reenters = active & (hold < 0)
-        hold = jnp.where(reenters, _pick(entry_holds, entry), hold)
-        entry = entry + reenters.astype(jnp.int32)
-        reenters &= hold >= 0
+        leaves = active & (hold < 0)
+        hold = jnp.where(leaves, _pick(entry_holds, entry), hold)
+        entry = entry + leaves.astype(jnp.int32)
+        held = ((new, first, second), met_after)
+        new = corner(jnp.maximum(hold, 0) >> 2)
+        return slot + 1, hold, new, leaves & (hold >= 0), held, entry, rows
 
-        def reenter() -> tuple:
-            entered = held_triangle(jnp.maximum(hold, 0))
-            return jax.tree.map(partial(jnp.where, reenters), entered, ((new, first, second), met_after))
-
-        points, met = jax.lax.cond(
-            jnp.any(reenters), reenter, lambda: ((new, first, second), met_after)
-        )
-        return slot + 1, hold, corner(jnp.maximum(hold, 0) >> 2), points, met, entry, rows, unsure
-
-    first_hold = jnp.maximum(entry_holds[0], 0)
+    nothing = jnp.zeros(lanes, origins.dtype)
+    point = (nothing, nothing, nothing)
     start = (
         jnp.zeros((), jnp.int32),
         entry_holds[0],  # 4 * (4 tet + f) + r; -1 when the ray is done
-        corner(first_hold >> 2),
-        *held_triangle(first_hold),
+        corner(jnp.maximum(entry_holds[0], 0) >> 2),
+        entry_holds[0] >= 0,  # lanes that enter the cage
+        ((point, point, point), point),  # the triangle through which the walk comes, and where it is met
         jnp.ones(lanes, jnp.int32),  # the next entry to take
         rows,
-        jnp.zeros(lanes, bool),
     )
-    _, hold, _, _, _, _, rows, unsure = jax.lax.while_loop(unfinished, step, start)
-    return rows, hold >= 0, unsure
+    _, hold, *_, rows = jax.lax.while_loop(unfinished, step, start)
+    return rows, hold >= 0
+
+
+def _way_out(*left: Bool[Array, " lanes"]) -> Int[Array, " lanes"]:
+    """The face left: the new vertex's triangle around the ray, right of one held corner, left of the next.
+
+    If rounding leaves none (a sliver seen edge-on), any other face than the entry advances.
+    """
+    return jnp.where(~left[1] & left[2], 0, jnp.where(~left[2] & left[0], 1, 2))
 
 
 def _choose(slot: Int[Array, " lanes"], zero: Point, one: Point, two: Point) -> Point:

@@ -26,7 +26,6 @@ class PackedEntries:
     holds: Int[Array, " total"]
     firsts: Int[Array, " P+1"]  # of each ray's; the last is the total
     overflow: Bool[Array, " P"]
-    unsure: Bool[Array, " P"]
     slots: int = struct.field(pytree_node=False)  # that the worst ray needs
 
     def of(self, rays: Int[Array, " n"]) -> Entries:
@@ -37,7 +36,6 @@ class PackedEntries:
         return Entries(
             holds=jnp.where(firsts + slots < ends, holds, -1),
             overflow=self.overflow[rays],
-            unsure=self.unsure[rays],
         )
 
     def take(self, rays: Int[np.ndarray, " n"]) -> "PackedEntries":
@@ -50,7 +48,6 @@ class PackedEntries:
             holds=self.holds[places],
             firsts=jnp.asarray(np.concatenate([[0], ends]), jnp.int32),
             overflow=self.overflow[rays],
-            unsure=self.unsure[rays],
             slots=self.slots,
         )
 
@@ -136,7 +133,6 @@ def _packed(parts: list[Entries], counts: Int[np.ndarray, " P"]) -> PackedEntrie
         holds=joined.holds,
         firsts=jnp.asarray(np.concatenate([[0], np.cumsum(counts)]), jnp.int32),
         overflow=joined.overflow,
-        unsure=joined.unsure,
         slots=int(counts.max()),
     )
 
