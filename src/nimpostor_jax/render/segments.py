@@ -169,12 +169,13 @@ def _covered(
         starts = (t_enter[1:] != t_exit[:-1]) | (rays[1:] != rays[:-1])
         starts = jnp.pad(starts, (1, 0), constant_values=True)
 
-        def join(left: tuple, right: tuple) -> tuple:
-            (t, start), (next_t, next_start) = left, right
-            return jnp.where(next_start, next_t, jnp.maximum(t, next_t)), start | next_start
+        walks, t = running(jnp.add, starts.astype(jnp.int32), 0), jax.lax.stop_gradient(t_exit)
 
-        reached, _ = jax.lax.associative_scan(join, (t_exit, starts))
-        before = jnp.concatenate([t_enter[:1], reached[:-1]])
+        def further(i: Int[Array, " n"], j: Int[Array, " n"]) -> Int[Array, " n"]:
+            return jnp.where((walks[i] == walks[j]) & (t[i] > t[j]), i, j)
+
+        reached = running(further, jnp.arange(len(t), dtype=jnp.int32), 0)  # the slot that went furthest
+        before = jnp.concatenate([t_enter[:1], t_exit[reached[:-1]]])
         return jnp.where(starts, t_enter, before)
 
     return jax.lax.cond(jnp.any(used & (t_enter - t_exit > rounding)), furthest, lambda: t_enter)
