@@ -151,7 +151,7 @@ def time_traversal(scene: Scene, repeats: int) -> Row:
     """Marching alone, on a training batch of incoherent rays."""
     mesh = scene.impostor.mesh
     batch = draw_batch(jax.random.key(0), 0, scene.pool, scene.config.train.rays_per_batch, "white")
-    tables, rays = jax.jit(march_tables)(mesh), to_local(mesh, batch.rays)
+    tables, rays = march_tables(mesh), to_local(mesh, batch.rays)
     march = jax.jit(traverse, static_argnums=2)
     first, median = measure(lambda: march(tables, rays, scene.render.march), repeats)
     segments = int((march(tables, rays, scene.render.march).codes >= 0).sum())

@@ -165,7 +165,7 @@ def _against_open3d(work: Work, rays: Rays) -> Match:
     tensor = open3d.core.Tensor
     scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
     lines = tensor(np.concatenate([rays.origins, rays.directions], axis=1))
-    exits = np.asarray(jax.jit(march_tables)(mesh).next_holds) < 0
+    exits = np.asarray(march_tables(mesh).next_holds) < 0
 
     def peer() -> np.ndarray:
         hits = scene.list_intersections(lines)
@@ -191,7 +191,7 @@ def _load_libusb() -> None:
 
 
 def _marching(mesh: TetMesh, rays: Rays, threads: int = CORES) -> Callable[[], Crossings]:
-    tables = jax.jit(march_tables)(mesh)
+    tables = march_tables(mesh)
     count = len(rays.origins)
     probe = jax.tree.map(lambda x: x[:: max(1, count // 8192)], rays)
     config = fit_capacities(mesh, tables, probe, STEPS).march

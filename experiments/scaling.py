@@ -112,7 +112,7 @@ def time_march(sweep: str, cells: int, size: int, rays_a_call: int, repeats: int
     build_s = time.process_time() - start
     rays = unordered_rays(size * size) if sweep == "cage_unordered" else camera_rays(size)
     rays = Rays(origins=(rays.origins - mesh.center) / mesh.scale, directions=rays.directions)
-    tables = jax.jit(march_tables)(mesh)
+    tables = march_tables(mesh)
     chunk = min(rays_a_call, size * size)
     chunks = [jax.tree.map(lambda x, i=i: x[i : i + chunk], rays) for i in range(0, size * size, chunk)]
     chunks[-1] = jax.tree.map(lambda x: x[-chunk:], rays)

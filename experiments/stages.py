@@ -87,7 +87,7 @@ def main(argv: Sequence[str]) -> None:
 
 def chunk_of_hits(impostor: NeuralImpostor | BakedImpostor, rays: Rays, config: RenderConfig) -> Rays:
     """A chunk of a frame's rays that hit the cage, tile by tile from all over the image."""
-    tables = jax.jit(march_tables)(impostor.mesh)
+    tables = march_tables(impostor.mesh)
     hits = np.flatnonzero(np.asarray(ray_entries(impostor.mesh, tables, rays, config.march).holds)[:, 0] >= 0)
     tile = 256
     tiles = np.linspace(0, len(hits) // tile - 1, CHUNK // tile).round().astype(int)
@@ -175,7 +175,7 @@ def baked_stages(baked: BakedImpostor, rays: Rays, config: RenderConfig) -> list
 
 def march_stages(stage: Callable, mesh: TetMesh, rays: Rays, config: RenderConfig) -> tuple:
     """Entries and segments; and the rays in the mesh's frame, and its tables."""
-    local, tables = to_local(mesh, rays), jax.jit(march_tables)(mesh)
+    local, tables = to_local(mesh, rays), march_tables(mesh)
     capacity = (config.march.capacity_per_ray or config.march.max_tets_per_ray) * rays.origins.shape[0]
     entries = stage("entries", lambda t, r: find_entries(t, r, config.march), tables, local)
     crossings = stage("march", lambda t, r, e: traverse(t, r, config.march, e), tables, local, entries)

@@ -129,7 +129,7 @@ def test_segments_that_no_light_reaches_change_nothing(overlapping, x64):
     baked = pushed_together(baked) if overlapping else baked
     config = dataclasses.replace(CONFIG, min_weight=0.05)
     local = to_local(baked.mesh, rays_at(baked))
-    segments = march_segments(baked.mesh, local, config)
+    segments = jax.jit(lambda rays: march_segments(baked.mesh, rays, config))(local)
     lit, _, count = jax.jit(lit_segments, static_argnames="least")(baked, segments, least=0.05)
     of_all, of_lit = (np.sum(np.asarray(each.tet_ids) >= 0) for each in (segments, lit))
     assert COUNT < count == of_lit < 0.8 * of_all

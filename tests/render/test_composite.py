@@ -86,8 +86,8 @@ def test_sums_before_follow_the_loop_over_what_is_used(used, backend, chunk, rng
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     rays = packed_rays([40, 3 * ROW, 1, 2 * ROW, 200])[: 5 * ROW + 7]
     values, mix = rng.uniform(0, 1, (2, len(rays))).astype(np.float32)
-    sums = sum_before(values, rays, jnp.int32(used))
-    gradient = jax.grad(lambda v: jnp.sum(mix * sum_before(v, rays, jnp.int32(used))))(values)
+    sums = jax.jit(lambda v: sum_before(v, rays, jnp.int32(used)))(values)
+    gradient = jax.jit(jax.grad(lambda v: jnp.sum(mix * sum_before(v, rays, jnp.int32(used)))))(values)
     for ray in range(5):
         mine = np.flatnonzero(rays[:used] == ray)
         before = np.cumsum(values[mine], dtype=np.float64) - values[mine]

@@ -130,7 +130,7 @@ def test_merged_levels_are_for_frames_only(scene, tmp_path):
         return render_rays(moved, rays, config).color.sum()
 
     with pytest.raises(ValueError, match="no derivatives"):
-        jax.grad(brightness)(merged.mesh.vertices)
+        jax.jit(jax.grad(brightness))(merged.mesh.vertices)
     for use in (trainable, lambda each: compose([each]), lambda each: save_impostor(saved, each)):
         with pytest.raises(ValueError, match="merged for frames"):
             use(merged)
@@ -151,7 +151,8 @@ def test_sorting_what_is_in_order_changes_nothing(scene):
     # That it sorts: samples given out of order come back in order
     order = jnp.asarray([3, 1, 2, 0], jnp.int32)
     local = to_local(impostor.mesh, rays)
-    plan = plan_samples(march_segments(impostor.mesh, local, RENDER), RENDER.sampler, "barycentric")
+    march = jax.jit(lambda rays: march_segments(impostor.mesh, rays, RENDER))
+    plan = plan_samples(march(local), RENDER.sampler, "barycentric")
     assert_array_equal(selection.in_order(plan, order, jnp.int32(4), RENDER), order)
     assert_array_equal(selection.in_order(plan, order, jnp.int32(4), always), jnp.sort(order))
 

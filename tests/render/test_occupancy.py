@@ -89,7 +89,7 @@ def test_only_samples_in_occupied_cells_are_rendered():
     shape = len(impostor.mesh.tets), num_cells(4)
     config = dataclasses.replace(RENDER, min_weight=1e-3)
     rays, _ = view(impostor)
-    output, samples = render_samples(impostor, rays, config)
+    output, samples = jax.jit(render_samples, static_argnames="config")(impostor, rays, config)
     seen = cells_of(samples.tet_ids, samples.lambdas, samples.deltas > 0, *shape)
     assert 0 < np.mean(seen) < 1
     again = render(dataclasses.replace(impostor, occupied=seen), rays, config)
@@ -98,7 +98,7 @@ def test_only_samples_in_occupied_cells_are_rendered():
     empty = dataclasses.replace(impostor, occupied=jnp.zeros(shape, bool))
     assert_array_equal(render(empty, rays, config).opacity, 0)
     kept = render(empty, rays, dataclasses.replace(config, skip_empty=False))
-    np.testing.assert_allclose(kept.color, output.color, atol=1e-5)  # compiled as one, and step by step
+    np.testing.assert_allclose(kept.color, output.color, atol=1e-5)  # other programs, fused otherwise
 
 
 @pytest.mark.parametrize("finer", [False, True])
@@ -118,15 +118,20 @@ def test_slabs_leave_out_only_what_cells_would(measure, cone, finer, rng):
     sampler = dataclasses.replace(sampler, max_samples_per_ray=256)
     config = dataclasses.replace(RENDER, sampler=sampler, min_weight=0.0)
     rays, _ = view(impostor)
-    local = to_local(impostor.mesh, rays)
-    segments = in_cells(march_segments(impostor.mesh, local, config), impostor.embedding)
+    mesh = impostor.mesh
+    segments = jax.jit(lambda rays: march_segments(mesh, to_local(mesh, rays), config))(rays)
+
+    @jax.jit
+    def sample(slabs):
+        plan = plan_samples(in_cells(segments, impostor.embedding), sampler, measure, slabs=slabs)
+        _, chosen, count = present_samples(impostor, plan, config)
+        return place_samples(plan, chosen, count), count, plan.num_used
+
     slabs, kept, planned = slabs_of(impostor, config), [], []
     for those in (None, slabs):
-        plan = plan_samples(segments, sampler, measure, slabs=those)
-        _, chosen, count = present_samples(impostor, plan, config)
-        samples = place_samples(plan, chosen, count)
+        samples, count, all_of_them = sample(those)
         kept.append([np.asarray(x)[: int(count)] for x in (samples.rays, samples.tet_ids, samples.t)])
-        planned.append(int(plan.num_used))
+        planned.append(int(all_of_them))
     for expected, found in zip(*kept, strict=True):
         assert_array_equal(found, expected)
     assert len(kept[0][0]) <= planned[1] < planned[0]

@@ -96,7 +96,8 @@ def test_each_texel_that_is_looked_up_is_there_once(rng, monkeypatch):
     monkeypatch.setattr(chunks, "CPU_CHUNK", 64)
     baked = scenes_baked.baked()
     batch = batch_for(baked, rng)
-    segments = march_segments(baked.mesh, to_local(baked.mesh, batch.rays), CONFIG)
+    march = jax.jit(lambda rays: march_segments(baked.mesh, to_local(baked.mesh, rays), CONFIG))
+    segments = march(batch.rays)
     tets, last = jnp.maximum(segments.tet_ids, 0), np.flatnonzero(segments.tet_ids >= 0)[-1] + 1
     arguments = baked.depths.layout, len(baked.depths.features), tets, segments.lambda_enter, jnp.int32(last)
     rows, layout, count = jax.jit(looked_up, static_argnums=1)(*arguments)

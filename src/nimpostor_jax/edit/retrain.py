@@ -156,7 +156,7 @@ def _render_stage(
     probe = draw_batch(key, 0, pool, min(PROBE_RAYS, config.rays_per_batch), "random")
     march = dataclasses.replace(render.march, max_entries_per_ray=pool.entries.slots)
     sized = dataclasses.replace(render, march=march)
-    tables = jax.jit(march_tables)(new.mesh)
+    tables = march_tables(new.mesh)
     sized = fit_capacities(new.mesh, tables, probe.rays, sized, embedding=new.embedding)
     gradient, place = loss_gradient, (lambda batch: batch)
     devices = dividing_devices(config.rays_per_batch)

@@ -70,7 +70,7 @@ def _crosses(mesh: TetMesh, region: Region, pool: PixelPool, march: MarchConfig)
     chosen = np.asarray(mesh.tets)[np.asarray(region.tets)]
     used, inverse = np.unique(chosen, return_inverse=True)
     part = build_in_frame(mesh, np.asarray(mesh.vertices)[used], inverse.reshape(-1, 4), deformed=True)
-    tables = jax.jit(march_tables)(part)
+    tables = march_tables(part)
     count = len(pool.views)
     padded = np.pad(np.arange(count), (0, -count % FILTER_PIXELS), mode="edge").reshape(-1, FILTER_PIXELS)
     found = []

@@ -57,7 +57,7 @@ def seen_parts(
         return None
     key, size = jax.random.key(config.seed + 3), config.rays_per_batch
     sample = draw_batch(key, 0, pool, size, "random")
-    tables = jax.jit(march_tables)(old.mesh)
+    tables = march_tables(old.mesh)
     sized = fit_capacities(old.mesh, tables, sample.rays, render, embedding=old.embedding)
     # Where places in the old mesh are known, tets may overlap, and must not be sought.
     target = None if region.sources is not None else NewMesh(new.mesh, locate_tables(new.mesh))

@@ -221,7 +221,7 @@ def fit_config(
     march = dataclasses.replace(config.march, max_entries_per_ray=pool.entries.slots)
     config = dataclasses.replace(config, march=march, frame_refinement=FIT_REFINEMENT)
     config = dataclasses.replace(refined(config), min_weight=max(config.min_weight, 1e-4) / FIT_REFINEMENT)
-    tables = jax.jit(march_tables)(mesh)
+    tables = march_tables(mesh)
     return fit_capacities(mesh, tables, probe.rays, config, embedding=impostor.embedding)
 
 

@@ -139,7 +139,7 @@ def prepare_views(
     entries = pool.entries.slots
     march = dataclasses.replace(config.render.march, max_entries_per_ray=entries)
     render = with_step(dataclasses.replace(config.render, march=march), config.impostor.encoding)
-    render = fit_capacities(mesh, jax.jit(march_tables)(mesh), probe.rays, render)
+    render = fit_capacities(mesh, march_tables(mesh), probe.rays, render)
     return Scene(config=config, train=train, test=test, impostor=impostor, pool=pool, render=render)
 
 

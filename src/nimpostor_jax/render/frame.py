@@ -41,7 +41,6 @@ class Frame(NamedTuple):
     error: Float[np.ndarray, "H W"] | None = None  # estimated, where a tolerance was given
 
 
-_march_tables = jax.jit(march_tables)
 _slabs_of = jax.jit(slabs_of, static_argnames="config")
 
 
@@ -82,7 +81,7 @@ def frame_config(
     (`capacity.fit_capacities`). Raises ValueError as `sampling.with_step`.
     """
     config = refined(with_step(config, impostor.config.encoding))
-    tables = _march_tables(impostor.mesh)
+    tables = march_tables(impostor.mesh)
     rays = _tiled_rays(camera, camera.height, camera.width)
     entries, march = all_entries(impostor.mesh, tables, rays, config.march)
     hits = np.flatnonzero(np.asarray(entries.holds)[:, 0] >= 0)
@@ -173,7 +172,7 @@ class View:
 
     def __init__(self, impostor: NeuralImpostor | BakedImpostor, camera: Camera, config: RenderConfig):
         self._impostor, self._config = impostor, config
-        self._tables = _march_tables(impostor.mesh)
+        self._tables = march_tables(impostor.mesh)
         # On the host, where chunks are picked without a program for each pick.
         self._rays = jax.tree.map(np.asarray, _tiled_rays(camera, camera.height, camera.width))
         mesh = device_mesh()

@@ -86,6 +86,7 @@ class Crossings:
     overflow: Bool[Array, " R"]  # more tets or entries than slots
 
 
+@jax.jit
 def march_tables(mesh: TetMesh) -> MarchTables:
     """Gather what `traverse` reads from the mesh; call again when vertices have moved."""
     vertices = jax.lax.stop_gradient(mesh.vertices)

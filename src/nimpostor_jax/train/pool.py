@@ -86,7 +86,7 @@ def build_pool(
 
     Raises ValueError where no pixel hits the cage.
     """
-    tables = jax.jit(march_tables)(mesh)
+    tables = march_tables(mesh)
     order = tile_order(cameras.height, cameras.width)
     grid = image_pixels(cameras.height, cameras.width).reshape(-1, 2)[order]
     cast = jax.jit(lambda camera: pixel_rays(camera, grid))
