@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scenes
 from meshes import tet_mesh
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -67,3 +68,17 @@ def test_to_local_divides_distances_by_the_scale(rng):
     t = 0.7
     world = rays.origins + t * mesh.scale * rays.directions
     assert_allclose(mesh.center + mesh.scale * (local.origins + t * local.directions), world, atol=1e-6)
+
+
+def test_a_pixels_ray_has_the_same_bits_in_a_picture_and_in_a_batch(rng, optimized):
+    """Of one camera, and of many that are gathered: other kernels, that fuse and divide in their own ways."""
+    cameras = [scenes.camera(90, 70, position=p) for p in ((3, 1, 2), (-2, 1.5, 2), (0.5, -2.5, 1.0))]
+    cameras = jax.tree.map(lambda *x: jnp.stack(x), *cameras)
+    view, y, x = (rng.integers(0, count, 4096) for count in (3, 70, 90))
+    picture = jax.jit(lambda camera: pixel_rays(camera, image_pixels(70, 90)))
+    batch = jax.jit(lambda view, pixels: pixel_rays(jax.tree.map(lambda c: c[view], cameras), pixels + 0.5))
+    found = batch(jnp.asarray(view), jnp.asarray(np.stack([x, y], axis=1)))
+    pictures = [picture(jax.tree.map(lambda c, i=i: c[i], cameras)) for i in range(3)]
+    for name in ("origins", "directions"):
+        expected = np.stack([getattr(rays, name) for rays in pictures])[view, y, x]
+        assert_array_equal(getattr(found, name), expected)

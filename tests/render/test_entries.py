@@ -134,7 +134,7 @@ def test_an_edge_that_points_to_the_camera_needs_no_care(rng, monkeypatch):
         monkeypatch.setattr(traversal, "mended", watched)
         codes.append(traverse(tables, rays, CONFIG).codes)
     jax.effects_barrier()
-    assert sum(doubts) <= 2 * COUNT // 10  # in both marches; half of the rays, if ties counted
+    assert doubts and sum(doubts) <= 2 * COUNT // 10  # in both marches; half of the rays, if ties counted
     assert_array_equal(*codes)
 
 

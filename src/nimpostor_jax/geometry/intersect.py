@@ -27,8 +27,8 @@ def ray_frame(directions: Sequence[Lanes]) -> tuple[tuple[Lanes, ...], ...]:
     sign = jnp.where(z >= 0, 1.0, -1.0).astype(x.dtype)
     a = -1 / (sign + z)
     b = x * y * a
-    across = (1 + _rounded(sign * x * x * a), sign * b, -sign * x)
-    return across, (b, sign + _rounded(y * y * a), -y), (x, y, z)
+    across = (1 + rounded(sign * x * x * a), sign * b, -sign * x)
+    return across, (b, sign + rounded(y * y * a), -y), (x, y, z)
 
 
 def project(
@@ -36,15 +36,15 @@ def project(
 ) -> tuple[Lanes, ...]:
     """Coordinates of a point on the given axes, relative to the ray's origin.
 
-    The same bits wherever it is compiled: without `_rounded`, some kernels would fuse multiply and add and
+    The same bits wherever it is compiled: without `rounded`, some kernels would fuse multiply and add and
     others not, and a ray through a vertex would pass it on different sides in different tets.
     """
     dx, dy, dz = (p - o for p, o in zip(point, origin, strict=True))
-    return tuple(_rounded(a[0] * dx) + _rounded(a[1] * dy) + _rounded(a[2] * dz) for a in axes)
+    return tuple(rounded(a[0] * dx) + rounded(a[1] * dy) + rounded(a[2] * dz) for a in axes)
 
 
-def _rounded(product: Lanes) -> Lanes:
-    """The product itself; the selection keeps compilers from fusing it with the addition that follows."""
+def rounded(product: Lanes) -> Lanes:
+    """A product itself; the selection keeps compilers from fusing it with the addition that follows."""
     return jnp.where(product == product, product, 0)
 
 
@@ -71,7 +71,7 @@ def quick_passes_left(
 
 
 def _products(u: Sequence[Lanes], v: Sequence[Lanes]) -> tuple[Lanes, Lanes]:
-    return _rounded(u[0] * v[1]), _rounded(u[1] * v[0])
+    return rounded(u[0] * v[1]), rounded(u[1] * v[0])
 
 
 def _rest(a: Lanes, b: Lanes, product: Lanes) -> Lanes:
@@ -83,7 +83,7 @@ def _rest(a: Lanes, b: Lanes, product: Lanes) -> Lanes:
 def _halves(x: Lanes) -> tuple[Lanes, Lanes]:
     """Two numbers of half the digits with the sum x (Veltkamp 1968): their products are exact."""
     digits = jnp.finfo(x.dtype).nmant + 1
-    scaled = _rounded(x * (2.0 ** -(-digits // 2) + 1))
+    scaled = rounded(x * (2.0 ** -(-digits // 2) + 1))
     high = scaled - (scaled - x)
     return high, x - high
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from nimpostor_jax.geometry.intersect import rounded
 from nimpostor_jax.types import Camera, Rays, TetMesh
 
 TILE = 16  # pixels on a tile's side
@@ -14,15 +15,19 @@ TILE = 16  # pixels on a tile's side
 def pixel_rays(camera: Camera, pixels: Float[Array, "*batch 2"]) -> Rays:
     """World-space rays through pixel positions (x right, y down, in pixels; a pixel's centre is at + 0.5).
 
-    Camera fields broadcast against the pixels' leading axes. Differentiable in the camera and the pixels.
+    Camera fields broadcast against the pixels' leading axes. Differentiable in the camera and the pixels. The
+    same bits wherever it is compiled: entries that were found for a pixel hold for its ray in other programs.
     """
-    offset = (pixels - camera.principal) / camera.focal
+    # By the reciprocal, as XLA divides by what is one for all pixels, and not by what each has its own of.
+    offset = (pixels - camera.principal) * (1 / camera.focal)
     x, y = offset[..., 0], -offset[..., 1]
     rotation = camera.camera_to_world[..., :3, :3]
-    directions = rotation[..., 0] * x[..., None] + rotation[..., 1] * y[..., None] - rotation[..., 2]
-    norm = jnp.sqrt(jnp.sum(directions**2, axis=-1, keepdims=True))
+    across, up = rounded(rotation[..., 0] * x[..., None]), rounded(rotation[..., 1] * y[..., None])
+    directions = across + up - rotation[..., 2]
+    squares = rounded(directions * directions)
+    norm = jnp.sqrt(squares[..., 0] + squares[..., 1] + squares[..., 2])
     origins = jnp.broadcast_to(camera.camera_to_world[..., :3, 3], directions.shape)
-    return Rays(origins=origins, directions=directions / norm)
+    return Rays(origins=origins, directions=directions / norm[..., None])
 
 
 def image_pixels(height: int, width: int) -> Float[Array, "height width 2"]:

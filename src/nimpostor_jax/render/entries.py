@@ -90,8 +90,7 @@ def search_entries(
         tests = [quick_passes_left(*edge) for edge in ((a, b), (b, c), (c, a))]
         quick, close = zip(*tests, strict=True)
         possible = (hold >= 0) & ((a[0] != b[0]) | (a[1] != b[1]))  # a point has no left and right
-        for left, tie in tests:
-            possible &= ~left | tie
+        possible &= ~(quick[0] | quick[1] | quick[2])  # nor is a tie left, quickly tested
 
         def insert() -> tuple:
             doubt = possible & (close[0] | close[1] | close[2])

@@ -62,7 +62,8 @@ _HELD_AS = _held_as()
 class Entries:
     """Where each ray's line enters the cage from outside, in order along the line; a fact of mesh and ray.
 
-    Finding them costs more than marching: find them once for rays that are cast again.
+    Finding them costs more than marching: find them once for rays that are cast again. They hold for the same
+    bits: a ray through an edge that is rounded otherwise may enter by the face on its other side.
     """
 
     holds: Int[Array, "R B"]  # 4 * (4 tet + f) of the boundary face; -1 pads
