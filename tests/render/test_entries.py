@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import oracles
 import pytest
 from meshes import grid, local_vertices, tet_mesh
 from numpy.testing import assert_allclose, assert_array_equal
@@ -85,6 +86,30 @@ def test_a_fold_covers_the_line_once(rng):
         enters, exits = (np.asarray(t[ray])[used] for t in (segments.t_enter, segments.t_exit))
         assert np.all(np.abs(enters[1:] - exits[:-1]) < 1e-6)
         assert np.sum(exits - enters) > size - 1e-5  # the box, and what sticks out of it
+
+
+def test_what_a_fold_has_covered_moves_with_the_vertices(rng, x64):
+    """Where a walk passes a part of the line again, its segments begin at an end of an earlier one."""
+    mesh = build_tet_mesh(*grid(np.ones((2, 2, 2), bool)), dtype="float64")
+    middle = np.argmin(np.sum(np.asarray(mesh.vertices) ** 2, axis=1))
+    beyond = np.max(np.asarray(mesh.vertices)) * np.array([1.5, 0.05, 0.02])
+    folded = mesh.replace(vertices=mesh.vertices.at[middle].set(jnp.asarray(beyond)))
+    y, z = rng.uniform(-0.3, 0.3, (2, 16))
+    rays = (np.stack([np.full(16, -3.0), y, z], axis=1), np.broadcast_to([1.0, 0.0, 0.0], (16, 3)))
+    mix = jnp.asarray(rng.normal(size=(16, CONFIG.max_tets_per_ray)))
+
+    @jax.jit
+    def starts(shift):
+        segments = walk(folded.replace(vertices=folded.vertices + shift), as_rays(rays, "float64"))
+        return jnp.sum(jnp.where(segments.tet_ids >= 0, mix * segments.t_enter, 0))
+
+    x = jnp.zeros(mesh.vertices.shape)
+    gradient = jax.jit(jax.grad(starts))(x)
+    for _ in range(4):
+        direction = jnp.asarray(rng.normal(size=x.shape))
+        expected = oracles.directional_difference(starts, x, direction, 1e-6)
+        # step^2 times third derivatives, which grow where a ray meets a face at a grazing angle
+        assert_allclose(jnp.sum(gradient * direction), expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize("reach", [1.5, 2.2])

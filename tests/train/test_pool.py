@@ -16,7 +16,7 @@ from nimpostor_jax.render.capacity import ray_entries
 from nimpostor_jax.render.traverse import march_tables
 from nimpostor_jax.train.pool import OPACITY_COST, build_pool, draw_batch
 
-WIDTH, HEIGHT = 14, 10
+WIDTH, HEIGHT = 17, 13
 
 
 @pytest.fixture(scope="module")

@@ -196,7 +196,7 @@ def _march_tile(
 
     The next vertex is projected at the end of each step and carried into the next: XLA compiles a kernel
     for each of a step's results, and each would repeat a projection that is not carried. For the same reason
-    nothing is stacked: points are three arrays each.
+    nothing is stacked but for careful tests: points are three arrays each.
     """
     origin, axes = _frame(origins, directions)
     lanes, slots = origins.shape[1], config.max_tets_per_ray
