@@ -37,8 +37,15 @@ def build_face_layout(resolutions: Int[np.ndarray, "T 4"]) -> FaceLayout:
 
 
 def face_of(lambdas: Float[Array, "M 4"]) -> Int[Array, " M"]:
-    """The face on which points lie, by the corner opposite; any one of two on an edge."""
-    return jnp.argmin(lambdas, axis=1).astype(jnp.int32)
+    """The face on which points lie, by the corner opposite; any one of two on an edge.
+
+    `jnp.argmin` would do the same in several times the time on a CPU.
+    """
+    least, face = lambdas[:, 0], jnp.zeros(lambdas.shape[0], jnp.int32)
+    for corner in range(1, 4):
+        face = jnp.where(lambdas[:, corner] < least, corner, face)
+        least = jnp.minimum(least, lambdas[:, corner])
+    return face
 
 
 @dataclass(frozen=True)

@@ -184,5 +184,6 @@ def in_basis(
     texels: Float[Array, "M 4*channels"], lambda_exit: Float[Array, "M 4"]
 ) -> Float[Array, "M channels"]:
     """Texels in a direction: linear in the coordinates at which the ray leaves the tet."""
-    coefficients = texels.reshape(texels.shape[0], BASIS, texels.shape[1] // BASIS)
-    return jnp.sum(lambda_exit[:, :, None] * coefficients, axis=1)
+    coefficients = enumerate(jnp.split(texels, BASIS, axis=1))
+    first, *others = (lambda_exit[:, i, None] * part for i, part in coefficients)
+    return sum(others, first)

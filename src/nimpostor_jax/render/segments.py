@@ -54,7 +54,9 @@ def locate_segments(
     packed = _pack(crossings, num_slots * num_rays if capacity is None else capacity)
     owners, codes = packed.rays, packed.codes
     geometry = (mesh.vertices, rays.origins, rays.directions)
-    t_enter, t_exit, lambda_enter, lambda_exit = _ends(geometry, mesh.tets, owners, codes, packed.ends)
+    t_enter, t_exit, lambda_enter, lambda_exit = _ends(
+        geometry, mesh.tets, owners, codes, packed.places, crossings.ends
+    )
     rounding = ROUNDING * jnp.finfo(t_exit.dtype).eps * (1 + jnp.abs(t_enter))
     covered = _covered(owners, codes >= 0, t_enter, t_exit, rounding)
     behind = jnp.maximum(covered, near)
@@ -126,7 +128,7 @@ class _Packed(NamedTuple):
 
     rays: Int[Array, " N"]
     codes: Int[Array, " N"]
-    ends: tuple[Float[Array, " N"], ...]  # six
+    places: Int[Array, " N"]  # among all of the crossings' slots
     overflow: Bool[Array, " R"]
 
 
@@ -136,19 +138,15 @@ def _pack(crossings: Crossings, capacity: int) -> _Packed:
     firsts = jnp.cumsum(lengths) - lengths
     counts = jnp.clip(capacity - firsts, 0, lengths)
     # Rays that cross anything mark their first place; a running maximum spreads the marks, which ascend.
-    places = jnp.where(counts > 0, firsts, capacity)
-    marks = jnp.zeros(capacity, jnp.int32).at[places].set(jnp.arange(num_rays, dtype=jnp.int32), mode="drop")
+    starts = jnp.where(counts > 0, firsts, capacity)
+    marks = jnp.zeros(capacity, jnp.int32).at[starts].set(jnp.arange(num_rays, dtype=jnp.int32), mode="drop")
     rays = running(jnp.maximum, marks, 0)
     order = jnp.arange(capacity, dtype=jnp.int32)
-    slots = jnp.clip(order - firsts[rays], 0, num_slots - 1)
-
-    def pick(rows: Array) -> Array:
-        return rows.reshape(-1)[slots * num_rays + rays]
-
+    places = jnp.clip(order - firsts[rays], 0, num_slots - 1) * num_rays + rays
     return _Packed(
         rays=rays,
-        codes=jnp.where(order < jnp.sum(counts), pick(crossings.codes), -1),
-        ends=tuple(map(pick, crossings.ends)),
+        codes=jnp.where(order < jnp.sum(counts), crossings.codes.reshape(-1)[places], -1),
+        places=places,
         overflow=crossings.overflow | (counts < lengths),
     )
 
@@ -187,27 +185,33 @@ def _ends(
     tets: Int[Array, "T 4"],
     rays: Int[Array, " N"],
     codes: Int[Array, " N"],
-    ends: tuple[Float[Array, " N"], ...],
+    places: Int[Array, " N"],
+    marched: tuple[Float[Array, "K R"], ...],
 ) -> Ends:
     """t and coordinates at both ends, as marched; the derivatives are those of `_recomputed_ends`."""
+    columns = tuple(x.reshape(-1) for x in marched)
+    count = jnp.sum(codes >= 0, dtype=jnp.int32)  # used slots come first
+    return map_used(_marched_ends, columns, (codes, places), count)
+
+
+def _marched_ends(columns: tuple[Float[Array, " KR"], ...], items: tuple) -> Ends:
+    codes, places = items
     local = jnp.maximum(codes, 0) % CODES_PER_TET
-    lambdas = [
-        _spread(jnp.asarray(triangles)[local], ends[start + 1], ends[start + 2])
-        for start, triangles in ((0, ENTRY_TRIANGLES), (3, EXIT_TRIANGLES))
-    ]
-    return ends[0], ends[3], lambdas[0], lambdas[1]
+    t_enter, *before, t_exit, after_a, after_b = (x[places] for x in columns)
+    lambda_enter = _spread(jnp.asarray(ENTRY_TRIANGLES)[local], *before)
+    return t_enter, t_exit, lambda_enter, _spread(jnp.asarray(EXIT_TRIANGLES)[local], after_a, after_b)
 
 
 def _ends_forward(
-    geometry: tuple, tets: Array, rays: Array, codes: Array, ends: tuple[Array, ...]
+    geometry: tuple, tets: Array, rays: Array, codes: Array, places: Array, marched: tuple[Array, ...]
 ) -> tuple[Ends, tuple]:
-    return _ends(geometry, tets, rays, codes, ends), (geometry, tets, rays, codes)
+    return _ends(geometry, tets, rays, codes, places, marched), (geometry, tets, rays, codes)
 
 
 def _ends_backward(arguments: tuple, cotangents: Ends) -> tuple:
     geometry, *constants = arguments
     _, pull = jax.vjp(lambda moving: _recomputed_ends(moving, *constants), geometry)
-    return *pull(cotangents), None, None, None, None
+    return *pull(cotangents), None, None, None, None, None
 
 
 _ends.defvjp(_ends_forward, _ends_backward)
