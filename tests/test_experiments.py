@@ -5,6 +5,7 @@ import importlib.util
 import sys
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from nimpostor_jax.config import MarchConfig
+from nimpostor_jax.preprocess.tetrahedralize import box_tets
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
 
@@ -211,3 +213,17 @@ def test_compiling_is_clocked_and_running_is_not():
     assert compiled > 0
     function(jnp.ones((7, 7))).block_until_ready()
     assert clock.seconds == compiled
+
+
+def test_a_loose_cage_draws_more_rays_so_that_as_many_show_the_object():
+    """The four middle pixels of 16 x 16: all rays hit the large box, and those four alone the small one."""
+    figure10 = importlib.import_module("figure10")
+    masks = np.zeros((2, 16, 16), np.float32)
+    masks[:, 7:9, 7:9] = 1
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, 2, 3] = 20
+    cameras = {"camera_to_world": poses, "focal": np.full((2, 2), 20.0), "principal": np.full((2, 2), 8.0)}
+    views = SimpleNamespace(masks=masks, **cameras)
+    for half_size, expected in [(10.0, 6400), (1.0, 128)]:  # 100 times 256 / 4, and 100, in steps of 64
+        cage = box_tets(np.array([[-half_size] * 3, [half_size] * 3]))
+        assert figure10.rays_per_batch(cage, views, 100) == expected

@@ -2,13 +2,24 @@
 
 import dataclasses
 import os
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
+from scipy.spatial.distance import pdist
 
 from nimpostor_jax.config import ExperimentConfig
 from nimpostor_jax.gin_flags import load_config
 from nimpostor_jax.pipeline import prepare as prepare_module
-from nimpostor_jax.pipeline.prepare import SMALL_LOOPS, fit_levels, load_cage, prepare, use_all_cores
+from nimpostor_jax.pipeline.prepare import (
+    SMALL_LOOPS,
+    fit_levels,
+    load_cage,
+    pixels_per_edge,
+    prepare,
+    use_all_cores,
+)
+from nimpostor_jax.preprocess.tetrahedralize import box_tets
 
 
 @pytest.mark.parametrize("pixels, levels", [(100.0, 13), (20.0, 10), (0.1, 1)])
@@ -19,6 +30,22 @@ def test_levels_with_cells_below_half_a_pixel_are_left_out(pixels, levels):
     assert config.impostor.encoding.num_levels == levels
     assert f"the finest of {levels} levels" in said[0]
     assert ("13 were asked for" in said[0]) == (levels < 13)
+
+
+def test_edges_count_by_the_volume_of_their_tets():
+    """Equal tets: the median. A skin of many small ones does not count, however many they are."""
+    vertices, tets = box_tets(np.array([[0.0, 0, 0], [1, 2, 3]]))
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    center = vertices.mean(axis=0)
+    poses[:, :3, 3] = center + np.array([0, 0, 4])
+    views = SimpleNamespace(camera_to_world=poses, focal=np.full((3, 2), 100.0))
+    lengths = np.concatenate([pdist(vertices[tet]) for tet in tets])
+    expected = np.median(lengths) * 100 / 4
+    assert pixels_per_edge(vertices, tets, views) == pytest.approx(expected)
+
+    skin = np.concatenate([vertices, *[center + 0.01 * (vertices - center)] * 9])
+    many = np.concatenate([tets + len(vertices) * i for i in range(10)])
+    assert pixels_per_edge(skin, many, views) == pytest.approx(expected, rel=1e-3)  # 9e-6 of the volume
 
 
 @pytest.mark.parametrize("own", ["", " --xla_backend_extra_options=some_option=1"])

@@ -21,8 +21,10 @@ from nimpostor_jax.preprocess.cage import Cage, cage_from_images
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
 from nimpostor_jax.preprocess.validate import (
     check_coverage,
+    edge_lengths,
     missed_foreground,
     quality_report,
+    signed_volumes,
 )
 from nimpostor_jax.render.capacity import fit_capacities
 from nimpostor_jax.render.sampling import with_step
@@ -131,7 +133,7 @@ def prepare_views(
     hits = f"{len(pool.views):,} training rays hit the cage"
     log(f"{hits}; {missed:.4%} of opaque pixels do not" if train.show_masks else hits)
     key = jax.random.key(config.train.seed)
-    config = fit_levels(config, pixels_per_cell(vertices, tets, train, 1), log)
+    config = fit_levels(config, pixels_per_edge(vertices, tets, train), log)
     impostor = init_impostor(key, mesh, config.impostor)
     entries = np.diff(impostor.tables.layout.starts).tolist()
     log(f"{len(tets)} tets, {sum(entries):,} table entries in {len(entries)} levels {entries}")
@@ -152,32 +154,35 @@ def prepare_trained(
     return prepare_views(config, train, test, cage, log)
 
 
-def fit_levels(config: ExperimentConfig, pixels_per_edge: float, log: Log = print) -> ExperimentConfig:
-    """The config without levels whose cells are narrower than `MIN_CELL` pixels: nothing could train them."""
+def fit_levels(config: ExperimentConfig, edge: float, log: Log = print) -> ExperimentConfig:
+    """The config without levels whose cells are narrower than `MIN_CELL` pixels: nothing could train them.
+
+    `edge` is the length of an edge in pixels.
+    """
     encoding = config.impostor.encoding
-    kept = [n for n in encoding.resolutions if pixels_per_edge / n >= MIN_CELL] or encoding.resolutions[:1]
+    kept = [n for n in encoding.resolutions if edge / n >= MIN_CELL] or encoding.resolutions[:1]
     log(
-        f"the finest of {len(kept)} levels has cells {pixels_per_edge / kept[-1]:.2f} pixels wide"
+        f"the finest of {len(kept)} levels has cells {edge / kept[-1]:.2f} pixels wide"
         + (f"; {encoding.num_levels} were asked for" if len(kept) < encoding.num_levels else "")
     )
     encoding = dataclasses.replace(encoding, num_levels=len(kept))
     return dataclasses.replace(config, impostor=dataclasses.replace(config.impostor, encoding=encoding))
 
 
-def pixels_per_cell(
-    vertices: Float[np.ndarray, "V 3"],
-    tets: Int[np.ndarray, "T 4"],
-    views: PosedImages,
-    resolution: int,
+def pixels_per_edge(
+    vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"], views: PosedImages
 ) -> float:
-    """Width in pixels of a grid cell of the given resolution, on the median edge at the median distance.
+    """Median length of the cage's edges, weighted by their tets' volume, in pixels at the median distance.
 
-    Between 1/2 and 1 is right for the finest level.
+    Samples are where volume is: of many cages most tets make a skin of small ones.
     """
-    edges = vertices[tets[:, [0, 0, 0, 1, 1, 2]]] - vertices[tets[:, [1, 2, 3, 2, 3, 3]]]
     distances = np.linalg.norm(views.camera_to_world[:, :3, 3] - vertices.mean(axis=0), axis=1)
     pixel = np.median(distances) / np.median(views.focal)
-    return float(np.median(np.linalg.norm(edges, axis=-1)) / resolution / pixel)
+    edges = edge_lengths(vertices, tets).reshape(-1)
+    order = np.argsort(edges)
+    volumes = np.repeat(np.abs(signed_volumes(vertices, tets)), 6)[order]
+    below = np.cumsum(volumes) - volumes / 2
+    return float(np.interp(volumes.sum() / 2, below, edges[order]) / pixel)
 
 
 def load_cage(

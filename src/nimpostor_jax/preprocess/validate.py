@@ -129,7 +129,7 @@ def check_tets(
         source, outside, f"tets with indices outside 0..{len(vertices) - 1}", "indices are 0-based"
     )
     volumes = signed_volumes(vertices.astype(np.float64), tets)
-    longest = _edge_lengths(vertices, tets).max(axis=1)
+    longest = edge_lengths(vertices, tets).max(axis=1)
     degenerate = np.abs(volumes) <= _DEGENERATE * longest**3
     _fail(source, degenerate, "degenerate tets (no volume)", "remove or remesh them")
     _fail(
@@ -186,10 +186,10 @@ def aspect_ratios(
     a, b, c = (vertices[tets[:, FACES[:, i]]] for i in range(3))
     areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1).sum(axis=1)
     inradius = 3.0 * np.abs(signed_volumes(vertices, tets)) / areas
-    return _edge_lengths(vertices, tets).max(axis=1) / (2.0 * np.sqrt(6.0) * inradius)
+    return edge_lengths(vertices, tets).max(axis=1) / (2.0 * np.sqrt(6.0) * inradius)
 
 
-def _edge_lengths(
+def edge_lengths(
     vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]
 ) -> Float[np.ndarray, "T 6"]:
     corners = np.asarray(vertices, np.float64)[tets]
