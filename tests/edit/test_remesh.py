@@ -135,7 +135,7 @@ def test_tables_start_near_the_old_features():
     places = np.broadcast_to(np.eye(4), (len(cells), 4, 4))
     new, region = with_region(made, made.mesh, changed, places, cells)
     source, start, off = locate_tables(made.mesh), new, []
-    draw = jax.jit(functools.partial(draw_points, count=1 << 13, measure="barycentric"))
+    draw = functools.partial(draw_points, count=1 << 13, measure="barycentric")
     for i in range(12):
         points = draw(jax.random.key(i), made, source, new, region)
         found = field.features(new, *to_cells(new.embedding, points.tets, points.lambdas))
@@ -286,11 +286,16 @@ def test_bad_input():
         consolidate(live, CONFIG, QUICK, quiet)
 
 
-def weights_by_part(made, rays, parts):
-    """The weights of samples in the tets and parts where they lie, by a loop of NumPy's, and their sum."""
+@jax.jit
+def weights_of(made, rays):
     output, samples = render_samples(made, rays, CONFIG)
     features = field.features(made, samples.tet_ids, samples.lambdas)
-    weights = optical_weights(field.density(made, samples.tet_ids, features), samples)
+    return output, samples, optical_weights(field.density(made, samples.tet_ids, features), samples)
+
+
+def weights_by_part(made, rays, parts):
+    """The weights of samples in the tets and parts where they lie, by a loop of NumPy's, and their sum."""
+    output, samples, weights = weights_of(made, rays)
     found = np.zeros((len(made.mesh.tets), parts))
     places = np.asarray(cell_index(jnp.zeros_like(samples.tet_ids), samples.lambdas, parts))
     np.add.at(found, (np.asarray(samples.tet_ids), places), np.asarray(weights))

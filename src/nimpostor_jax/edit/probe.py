@@ -3,6 +3,8 @@
 Axes: M points, C features.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,6 +39,7 @@ class Points:
     present: Bool[Array, " M"]  # in the old mesh, and let through by its gates
 
 
+@partial(jax.jit, static_argnames=("count", "measure"))
 def draw_points(
     key: Array,
     old: NeuralImpostor,
@@ -137,17 +140,16 @@ def occupancy_of(
     cells, num_parts = np.asarray(_cells_of_region(new, region)), new.occupied.shape[1]
     everything = np.arange(len(cells) * num_parts)
     found, batch = np.zeros(everything.size, bool), config.points_per_batch
-    look = jax.jit(_occupied_at)
     key = jax.random.key(config.seed + 2)
     for _ in range(OCCUPANCY_POINTS):
         for start in range(0, everything.size, batch):
             key, point_key = jax.random.split(key)
-            parts = np.resize(everything[start : start + batch], batch)
-            hits = np.asarray(look(point_key, old, source, new, region, jnp.asarray(parts, jnp.int32)))
-            found[parts] |= hits
+            parts = np.resize(everything[start : start + batch], batch).astype(np.int32)
+            found[parts] |= np.asarray(_occupied_at(point_key, old, source, new, region, parts))
     return new.occupied.at[cells].set(jnp.asarray(found.reshape(len(cells), num_parts)))
 
 
+@jax.jit
 def _occupied_at(
     key: Array,
     old: NeuralImpostor,

@@ -92,7 +92,7 @@ def retrain(
     render = with_step(render, new.config.encoding)  # complains now, and not after stage 1
     key, optimizer = jax.random.key(config.seed), make_optimizer()
     source = locate_tables(old.mesh)
-    draw = jax.jit(partial(draw_points, measure=render.density_measure), static_argnames="count")
+    draw = partial(draw_points, measure=render.density_measure)
     new = dataclasses.replace(new, occupied=occupancy_of(old, source, new, region, config))
     if config.render_steps or new.occupied is not None:
         pool = pictures_of(old, new, region, render, config)

@@ -52,6 +52,7 @@ class LocateTables:
     tolerance: Float[Array, ""]
 
 
+@jax.jit
 def locate_tables(mesh: TetMesh) -> LocateTables:
     """What `locate` reads from the mesh; call again when vertices have moved."""
     vertices = jax.lax.stop_gradient(mesh.vertices)
@@ -175,6 +176,7 @@ def _cells(
     return jnp.clip(cells, 0, side - 1).astype(jnp.int32)
 
 
+@jax.jit
 def find_tets(tables: LocateTables, points: Float[Array, "N 3"]) -> Int[Array, " N"]:
     """The tet of each point, -1 outside; points in the mesh's own frame."""
     if not points.shape[0]:
