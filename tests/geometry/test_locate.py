@@ -146,12 +146,17 @@ def test_vertices_edges_and_faces_are_never_lost():
     np.testing.assert_array_equal(again, tet_ids[order])
 
 
-def test_flat_and_inverted_tets_do_not_swallow_points():
+@pytest.mark.parametrize("shares", [[1, 0, 0, 0], [0.3, 0.7, 0, 0]])
+@pytest.mark.parametrize("moved", [[1, 2, 3], [2]])
+def test_flat_and_inverted_tets_do_not_swallow_points(moved, shares):
+    """Corners of a tet moved to its first one, or onto an edge: rounding leaves faces with a normal."""
     vertices, tets, _ = cloud()
     mesh = build_tet_mesh(vertices, tets)
-    collapsed = mesh.vertices.at[mesh.tets[5, 1:]].set(mesh.vertices[mesh.tets[5, 0]])
-    mesh = mesh.replace(vertices=collapsed)
+    place = jnp.asarray(shares, jnp.float32) @ mesh.vertices[mesh.tets[5]]
+    mesh = mesh.replace(vertices=mesh.vertices.at[mesh.tets[5, jnp.asarray(moved)]].set(place))
+    flat = np.random.default_rng(2).dirichlet(np.ones(4), 64) @ world_vertices(mesh)[np.asarray(mesh.tets[5])]
     points = box_points(mesh, COUNT, 8, grow=2.0)
+    points[: len(flat)] = flat
     tet_ids = np.asarray(locate(mesh, jnp.asarray(points))[0])
     outside = np.any(np.abs(points - np.asarray(mesh.center)) > 1.001 * np.abs(
         world_vertices(mesh) - np.asarray(mesh.center)).max(axis=0), axis=1)  # fmt: skip

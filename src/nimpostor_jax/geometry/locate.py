@@ -98,9 +98,13 @@ def _planes(vertices: Float[Array, "V 3"], tets: Int[Array, "T 4"]) -> Float[Arr
     even = ((a < b) & (b < c)) | ((b < c) & (c < a)) | ((c < a) & (a < b))
     inverted = signed_volumes(corners(vertices, tets))[:, None] < 0
     first, second, third = (vertices[ordered[..., i]] for i in range(3))
-    normal = cross(second - first, third - first)
+    edges = second - first, third - first
+    normal = cross(*edges)
     squared = jnp.sum(normal * normal, axis=-1, keepdims=True)
-    valid = squared > 0
+    # The normal of a face without area is rounding, which compiled programs leave where others cancel.
+    rounding = (TOLERANCE * jnp.finfo(vertices.dtype).eps) ** 2
+    across, along = (jnp.sum(edge * edge, axis=-1, keepdims=True) for edge in edges)
+    valid = squared > rounding * across * along
     # FACES are counter-clockwise seen from outside a tet that is not inverted.
     outward = jnp.where(even ^ inverted, 1, -1).astype(vertices.dtype)[..., None]
     normal = -outward * normal / jnp.sqrt(jnp.where(valid, squared, 1))
