@@ -99,7 +99,8 @@ def rays_per_batch(cage: Cage, views: PosedImages, count: int) -> int:
     all_rays = missed_foreground(*cage, np.ones_like(views.masks), *cameras)
     shown = missed_foreground(*cage, views.masks, *cameras)
     hits, object_hits = (int(np.sum(rays.foreground - rays.missed)) for rays in (all_rays, shown))
-    return ROUND_RAYS * math.ceil(count * hits / object_hits / ROUND_RAYS)
+    share = hits / max(object_hits, 1)  # a cage of another object is refused when the scene is prepared
+    return ROUND_RAYS * math.ceil(count * share / ROUND_RAYS)
 
 
 def proxy_cage(proxy: str, views: PosedImages, config: CageConfig) -> Cage:

@@ -192,7 +192,7 @@ def aspect_ratios(
 def edge_lengths(
     vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]
 ) -> Float[np.ndarray, "T 6"]:
-    """Length of each tet's six edges."""
+    """Length of each tet's six edges, from its first corner on, in the vertices' units (float64)."""
     corners = np.asarray(vertices, np.float64)[tets]
     return np.linalg.norm(corners[:, _EDGES[:, 0]] - corners[:, _EDGES[:, 1]], axis=-1)
 
