@@ -100,10 +100,7 @@ def main(argv: Sequence[str]) -> None:
     rows = []
     for lever, value, render in settings:
         shown = impostors.get(lever, impostor)
-        sized, own_render = frame_config(shown, cameras[0], render), render
-        if lever == "min_weight":  # which frames of mostly visible samples leave out
-            sized = dataclasses.replace(sized, min_weight=render.min_weight / render.frame_refinement)
-        render = sized
+        own_render, render = render, frame_config(shown, cameras[0], render)
         tolerance = value if lever == "tolerance" else None
         images = pictures(partial(render_frame, shown, config=render, tolerance=tolerance))
         exact = seen if lever == "tolerance" else references
@@ -177,7 +174,7 @@ def levers(base: RenderConfig) -> list[tuple[str, Any, RenderConfig]]:
         settings.append(("cone_angle", angle, sampler(cone_angle=angle)))
     for most in (32, 64):
         settings.append(("max_samples", most, sampler(max_samples_per_ray=most)))
-    for weight in (1e-4, 1e-3, 1e-2):
+    for weight in sorted({0.0, 1e-4, 1e-3, 1e-2} - {base.min_weight}):  # 0: in one pass
         settings.append(("min_weight", weight, dataclasses.replace(base, min_weight=weight)))
     settings.append(("skips", "not empty", dataclasses.replace(base, skip_empty=False)))
     settings.append(("skips", "all sorted", dataclasses.replace(base, skip_sorting=False)))

@@ -17,16 +17,14 @@ from jaxtyping import Array, Bool, Float, Int
 from nimpostor_jax.config import MarchConfig, RenderConfig
 from nimpostor_jax.render.camera import to_local
 from nimpostor_jax.render.sampling import plan_samples, segment_measure, step_boundaries
-from nimpostor_jax.render.segments import in_cells, locate_segments, march_segments
-from nimpostor_jax.render.selection import present_samples, slabs_of, visible_samples
+from nimpostor_jax.render.segments import in_cells, locate_segments
+from nimpostor_jax.render.selection import present_samples, slabs_of
 from nimpostor_jax.render.traverse import Entries, MarchTables, find_entries, traverse
 from nimpostor_jax.types import Embedding, NeuralImpostor, Rays, TetMesh
 
 # A chunk of a frame is 32 image tiles from all over it, whose mean varies by a tenth. Room that is not used
 # costs next to nothing; rays that do not fit cost a second program.
 SHARED_MARGIN = 1.4
-ONE_PASS = 0.4  # share of visible samples above which a pass that tells them apart does not pay
-VISIBLE_EVERY = 8  # of the sample rays: that pass needs features, the others only numbers
 MAX_GROWTH = 6  # doublings of a buffer before giving up
 
 
@@ -98,19 +96,6 @@ def _demand(
     )
 
 
-@partial(jax.jit, static_argnames="config")
-def _visible_share(
-    field: NeuralImpostor, tables: MarchTables, rays: Rays, config: RenderConfig
-) -> Float[Array, ""]:
-    """Of the samples that may be seen, the share that contributes `min_weight`; in buffers that fit."""
-    segments = march_segments(field.mesh, to_local(field.mesh, rays), config, tables)
-    in_field, slabs = in_cells(segments, field.embedding), slabs_of(field, config)
-    plan = plan_samples(in_field, config.sampler, config.density_measure, slabs=slabs)
-    plan, chosen, present = present_samples(field, plan, config)
-    _, _, visible = visible_samples(field, plan, chosen, present, config, None)
-    return visible / jnp.maximum(present, 1)
-
-
 def fit_capacities(
     mesh: TetMesh,
     tables: MarchTables,
@@ -127,8 +112,8 @@ def fit_capacities(
 
     `margin` is that of a single ray's slots; buffers that rays share have `SHARED_MARGIN`. Slots are rounded
     up to multiples of 8; `max_samples_per_ray` of the given config stays the limit. With a `field`, for
-    frames of it, the buffers behind its occupancy are fitted too, and `min_weight` is set to 0 where finding
-    out which samples are visible would cost more than it spares (`ONE_PASS`).
+    frames of it, the buffers behind its occupancy are fitted too, and `min_weight` is set to 0 where features
+    are integrated: no sample has a colour to spare then.
     Raises ValueError where a ray crosses more tets than 2**6 times the config's slots.
     """
     of_frames = field is not None
@@ -168,11 +153,7 @@ def fit_capacities(
         occupied_per_ray=None if field is None else _mean(demand.occupied, len(total)),
     )
     config = dataclasses.replace(config, march=march, sampler=sampler)
-    one_pass = of_frames and config.integrate == "features"  # samples then have no colours to spare
-    if field is not None and config.min_weight > 0 and not one_pass:
-        few = jax.tree.map(lambda x: x[::VISIBLE_EVERY], rays)
-        one_pass = bool(_visible_share(field, tables, few, config) > ONE_PASS)
-    if one_pass:
+    if of_frames and config.integrate == "features":
         config = dataclasses.replace(config, min_weight=0.0)
     return config
 

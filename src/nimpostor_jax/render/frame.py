@@ -77,7 +77,7 @@ def frame_config(
     """`config` with a frame's steps and buffers that fit this camera's view; use it for a whole animation.
 
     Sizes are measured on pixels spread over those that hit the cage. What overflows nevertheless,
-    `render_frame` renders again. Where most samples are visible, `min_weight` becomes 0
+    `render_frame` renders again. Where features are integrated, `min_weight` becomes 0
     (`capacity.fit_capacities`). Raises ValueError as `sampling.with_step`.
     """
     config = refined(with_step(config, impostor.config.encoding))
