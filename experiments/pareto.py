@@ -7,7 +7,8 @@ the same field (an eighth of the default steps, nothing visible left out); `shar
 within the tolerance of it (without cells that training never saw), or 1/255 where none was given; the PSNR is
 that to the held-out images. `--also` adds other runs on the same data (another interpolation, layout or
 number of levels), each against its own integral. Writes `pareto.csv`, `pareto.json` and `pareto.png`.
-Settings take turns in random order, so that a slow minute hits all of them; times are medians without compilation.
+Settings take turns in random order, so that a slow minute hits all of them; times are medians without
+compilation.
 """
 
 import argparse
