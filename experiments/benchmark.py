@@ -263,21 +263,22 @@ def time_frames(impostor: NeuralImpostor, scene: Scene, size: int, repeats: int)
     full = scene.config.render
     every_cell = dataclasses.replace(full, skip_empty=False)
     sorting = dataclasses.replace(full, skip_sorting=False)
-    everything = dataclasses.replace(every_cell, skip_sorting=False)
+    one_pass = dataclasses.replace(full, min_weight=0.0)
+    everything = dataclasses.replace(one_pass, skip_empty=False, skip_sorting=False)
     merged, impostor = for_frames(impostor), on_all_devices(impostor)
-    settings: dict[str, tuple[NeuralImpostor, RenderConfig, dict[str, float], bool]] = {
-        "": (merged, full, {}, False),
-        "_with_single_levels": (impostor, full, {}, False),
-        "_with_empty_cells": (merged, every_cell, {}, False),
-        "_with_sorting": (merged, sorting, {}, False),
-        "_in_one_pass": (merged, full, {"min_weight": 0.0}, False),
-        "_with_empty_pixels": (merged, full, {}, True),
-        "_with_everything": (impostor, everything, {"min_weight": 0.0}, True),
+    settings: dict[str, tuple[NeuralImpostor, RenderConfig, bool]] = {
+        "": (merged, full, False),
+        "_with_single_levels": (impostor, full, False),
+        "_with_empty_cells": (merged, every_cell, False),
+        "_with_sorting": (merged, sorting, False),
+        "_in_one_pass": (merged, one_pass, False),
+        "_with_empty_pixels": (merged, full, True),
+        "_with_everything": (impostor, everything, True),
     }
     calls, images, times = {}, {}, {}
     pixels = np.arange(camera.width * camera.height)
-    for name, (field, config, passes, all_pixels) in settings.items():
-        config = dataclasses.replace(frame_config(field, camera, config), **passes)
+    for name, (field, config, all_pixels) in settings.items():
+        config = frame_config(field, camera, config)
         if all_pixels:
             calls[name] = lambda field=field, config=config: View(field, camera, config).render(pixels)
         else:

@@ -199,7 +199,7 @@ class RenderConfig:
     sampler: SamplerConfig = SamplerConfig()
     density_measure: Literal["barycentric", "euclidean"] = "barycentric"  # Eq. 9 or Eq. 8
     near: float = 0.0  # in world units
-    min_weight: float = 1e-3  # samples of less get no colour and no gradient (frames may take all); 0: all do
+    min_weight: float = 1e-3  # samples of less get no colour and no gradient; 0: all do
     skip_empty: bool = True  # leave out samples in cells that training found empty or hidden
     skip_sorting: bool = True  # sort samples along rays only where tets overlap
     explore: float = 1 / 16  # share of training's rays that look into all cells nevertheless
