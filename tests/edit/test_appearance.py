@@ -135,8 +135,6 @@ def test_bad_input():
     with pytest.raises(ValueError, match=r"must be in \(0, 1\)"):
         uniform(made.mesh, (0, 0.5, 1), 1.0, made.config)
     with pytest.raises(ValueError, match="integrate must be 'color'"):
-        render_rays(
-            recolored(made, solid, RED), rays_of(), dataclasses.replace(CONFIG, integrate="features")
-        )
+        render(recolored(made, solid, RED), rays_of(), dataclasses.replace(CONFIG, integrate="features"))
     with pytest.raises(ValueError, match="function, which no file can hold"):
         save_impostor("never.npz", recolored(made, solid, RED))

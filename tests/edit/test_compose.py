@@ -60,6 +60,14 @@ def test_one_impostor_composed_is_itself(integrate):
     assert_same_picture(render(composed, rays, config), expected, 1e-5)
 
 
+@jax.jit
+def decoded(impostor, tets, lambdas, directions):
+    """Densities and colours at points of an impostor."""
+    features = field.features(impostor, tets, lambdas)
+    views = field.encode_directions(impostor, directions)
+    return field.density(impostor, tets, features), field.radiance(impostor, tets, features, views)
+
+
 @pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 10])
 def test_overlapping_objects_are_merged_by_depth(count, x64):
     """Against a float64 loop over all of a ray's samples by depth, each decoded by its own impostor."""
@@ -78,12 +86,9 @@ def test_overlapping_objects_are_merged_by_depth(count, x64):
     sigma, color = np.zeros(used), np.zeros((used, 3))
     first = 0
     for each in made:
-        mine = np.flatnonzero((tets >= first) & (tets < first + len(each.mesh.tets)))
-        ids, places = jnp.asarray(tets[mine] - first), jnp.asarray(lambdas[mine])
-        features = field.features(each, ids, places)
-        views = field.encode_directions(each, rays.directions)[owners[mine]]
-        sigma[mine] = field.density(each, ids, features)
-        color[mine] = field.radiance(each, ids, features, views)
+        mine = (tets >= first) & (tets < first + len(each.mesh.tets))
+        own = decoded(each, np.where(mine, tets - first, 0), lambdas, rays.directions[owners])
+        sigma[mine], color[mine] = (np.asarray(x)[mine] for x in own)
         first += len(each.mesh.tets)
     expected, left = np.zeros((len(output.opacity), 3)), np.ones(len(output.opacity))
     for k in np.lexsort((t, owners)):

@@ -319,7 +319,8 @@ def test_what_is_seen_adds_up_in_the_parts(overlapping):
     target = None if overlapping else NewMesh(mesh, locate_tables(mesh))
     expected = (expected if overlapping else expected[order])[inside]
     batch = RayBatch(rays=rays, target=None, background=None, jitter=None)
-    found = add_seen(jnp.zeros_like(expected), made, target, jnp.asarray(rows), batch, CONFIG)
+    add = jax.jit(add_seen, static_argnames="config")
+    found = add(jnp.zeros_like(expected), made, target, jnp.asarray(rows), batch, config=CONFIG)
     # a sample within rounding of a part's side may count on the other
     off = np.abs(found - expected)
     assert np.sum(off) < 0.01 * np.sum(expected) and np.median(off) < 1e-6

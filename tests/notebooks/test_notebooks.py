@@ -18,7 +18,6 @@ CASES = [pytest.param(p, marks=[pytest.mark.slow] * (p.stem in SLOW), id=p.stem)
 @pytest.mark.parametrize("path", CASES)
 def test_runs(path, monkeypatch):
     monkeypatch.setitem(os.environ, "MPLBACKEND", "agg")
-    monkeypatch.setitem(os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # compiled in half of the time
     notebook = nbformat.read(path, as_version=4)
     folder = {"metadata": {"path": str(path.parent)}}
     NotebookClient(notebook, timeout=600, kernel_name="python3", resources=folder).execute()
