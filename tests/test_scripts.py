@@ -10,12 +10,14 @@ import sys
 from pathlib import Path
 
 import captures
+import jax
 import numpy as np
 import pytest
 
 from nimpostor_jax.io.blender import load_blender
 from nimpostor_jax.io.mesh_files import load_tets
 from nimpostor_jax.io.scenes import builtin_scene
+from nimpostor_jax.pipeline.prepare import SMALL_LOOPS
 from nimpostor_jax.preprocess.validate import missed_foreground
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,8 +35,8 @@ SMALL = [
 @pytest.fixture
 def run_here(monkeypatch, capsys):
     """Run a script to its end within this process, which has imported most of what it needs."""
-    # Devices and compilation stay as they are.
-    chosen = "--xla_force_host_platform_device_count=2 --xla_backend_extra_options="
+    jax.devices()  # found before what scripts say about them, which is without effect then
+    chosen = f"--xla_force_host_platform_device_count=2 {SMALL_LOOPS}"
     monkeypatch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} {chosen}")
     monkeypatch.syspath_prepend(str(ROOT / "experiments"))
 
@@ -54,7 +56,7 @@ def run(script, *arguments, timeout=300):
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, env=quick)
 
 
-def test_train_and_render(tmp_path):
+def test_train_and_render(tmp_path, run_here):
     """(`.ci/run` evaluates the same run again.)"""
     done = run("train.py", "--data=fluffy_ball", f"--workdir={tmp_path}", *SMALL)
     assert done.returncode == 0, done.stderr
@@ -66,9 +68,9 @@ def test_train_and_render(tmp_path):
 
     kept = (tmp_path / "config.gin").read_text()
     other = [*SMALL, "TrainConfig.learning_rate=0.02", "TrainConfig.log_every=7"]
-    done = run("train.py", "--data=fluffy_ball", f"--workdir={tmp_path}", *other)
-    assert done.returncode == 2
-    assert "a finished run with TrainConfig.learning_rate = 0.01, not 0.02" in done.stderr
+    status, _, errors = run_here("train.py", "--data=fluffy_ball", f"--workdir={tmp_path}", *other)
+    assert status == 2
+    assert "a finished run with TrainConfig.learning_rate = 0.01, not 0.02" in errors
     assert (tmp_path / "config.gin").read_text() == kept
 
     bend = tmp_path / "twist.json"
