@@ -35,7 +35,7 @@ SMALL = [
 @pytest.fixture
 def run_here(monkeypatch, capsys):
     """Run a script to its end within this process, which has imported most of what it needs."""
-    jax.devices()  # found before what scripts say about them, which is without effect then
+    jax.devices()  # initialised first: what a script says about devices is without effect then
     chosen = f"--xla_force_host_platform_device_count=2 {SMALL_LOOPS}"
     monkeypatch.setenv("XLA_FLAGS", f"{os.environ.get('XLA_FLAGS', '')} {chosen}")
     monkeypatch.syspath_prepend(str(ROOT / "experiments"))
