@@ -17,7 +17,7 @@ from train import train
 from nimpostor_jax.gin_flags import add_flags, load_config, run_cli
 from nimpostor_jax.io.mesh_files import save_tets
 from nimpostor_jax.pipeline.capture import box_region, captured_cage, check_coarse, make_scene
-from nimpostor_jax.pipeline.prepare import use_all_cores
+from nimpostor_jax.pipeline.prepare import settings_of, use_all_cores
 from nimpostor_jax.render.sampling import with_step
 
 CONFIGS = Path(__file__).parent / "configs"
@@ -61,7 +61,8 @@ def main(argv: Sequence[str]) -> None:
     check_coarse(coarse, args.workdir)
     cage = args.workdir / "cage.npz"
     if not cage.exists():
-        save_tets(cage, *captured_cage(folder, region, config, coarse, args.workdir))
+        built = captured_cage(folder, region, config, coarse, args.workdir)
+        save_tets(cage, *built, settings_of(config.cage))
     train(config, folder, args.workdir, cage=cage, max_minutes=args.max_minutes)
 
 

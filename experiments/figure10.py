@@ -23,6 +23,7 @@ from ladder import (
     QUICK_RESOLUTION,
     Row,
     config_of,
+    scene_name,
     train_or_reuse,
     write_picture,
     write_table,
@@ -34,9 +35,9 @@ from nimpostor_jax.gin_flags import add_flags, run_cli
 from nimpostor_jax.io.blender import PosedImages, load_scene
 from nimpostor_jax.io.mesh_files import load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
-from nimpostor_jax.pipeline.prepare import use_all_cores
+from nimpostor_jax.pipeline.prepare import check_built, settings_of, use_all_cores
 from nimpostor_jax.preprocess.cage import cage_from_images
-from nimpostor_jax.preprocess.tetrahedralize import box_tets, run_ftetwild
+from nimpostor_jax.preprocess.tetrahedralize import box_tets, is_sound, run_ftetwild
 from nimpostor_jax.preprocess.validate import missed_foreground
 from nimpostor_jax.preprocess.visual_hull import visual_hull
 from nimpostor_jax.train.sharding import num_cores
@@ -75,10 +76,12 @@ def main(argv: Sequence[str]) -> None:
     rows: list[Row] = []
     runs: list[Path] = []
     for proxy in args.proxies:
-        folder = args.out / Path(args.scene).name / f"{resolution}" / proxy
+        folder = args.out / scene_name(args.scene) / f"{resolution}" / proxy
         cage = folder / "cage.npz"
-        if not cage.exists():
-            save_tets(cage, *proxy_cage(proxy, views, config.cage))
+        if cage.exists():
+            check_built(cage, config.cage)
+        else:
+            save_tets(cage, *proxy_cage(proxy, views, config.cage), settings_of(config.cage))
         rays = rays_per_batch(load_tets(cage), views, config.train.rays_per_batch)
         own = dataclasses.replace(config, train=dataclasses.replace(config.train, rays_per_batch=rays))
         trained = train_or_reuse("BarySpl", own, args.scene, cage, folder)
@@ -112,10 +115,9 @@ def proxy_cage(proxy: str, views: PosedImages, config: CageConfig) -> Cage:
         views.masks, views.camera_to_world, views.focal, views.principal,
         resolution=config.grid_resolution, names=views.names,
     )  # fmt: skip
-    points = grid.bounds[0] + (np.argwhere(grid.occupied) + 0.5) * grid.voxel_size
     center = grid.bounds.mean(axis=0)
     diagonal = float(np.linalg.norm(np.diff(grid.bounds, axis=0)))
-    surface = _shape(proxy, points - center)(config.margin * diagonal)
+    surface = _shape(proxy, grid.centers - center)(config.margin * diagonal)
     surface.apply_translation(center)
     if proxy == "box":
         return box_tets(surface.bounds)
@@ -133,8 +135,12 @@ def fill(surface: trimesh.Trimesh, target: int, epsilon: float) -> Cage:
     edge, attempts, rng = LONG_EDGE, [], np.random.default_rng(0)
     for call in range(FILL_CALLS):
         vertices, tets = run_ftetwild(surface, epsilon, edge)
-        attempts.append((math.log(max(len(tets), 1) / target), edge, epsilon, (vertices, tets)))
         print(f"fTetWild call {call + 1}: edges of {edge:.3f}, {len(tets)} tets", flush=True)
+        if len(tets) and is_sound(vertices, tets):
+            attempts.append((math.log(len(tets) / target), edge, epsilon, (vertices, tets)))
+        if not attempts:
+            edge *= math.exp(rng.uniform(-SPREAD, SPREAD))
+            continue
         off, edge, epsilon, best = min(attempts, key=lambda attempt: abs(attempt[0]))
         if abs(off) < CLOSE_ENOUGH:
             return best
@@ -142,6 +148,8 @@ def fill(surface: trimesh.Trimesh, target: int, epsilon: float) -> Cage:
             epsilon *= math.exp(off / EPSILON_SLOPE + rng.uniform(0, SPREAD))
         else:
             edge *= math.exp(off / EDGE_SLOPE + rng.uniform(-SPREAD, SPREAD))
+    if not attempts:
+        raise ValueError(f"fTetWild returned no usable mesh in {FILL_CALLS} calls; enlarge CageConfig.margin")
     if not 0.8 <= len(best[1]) / target <= 1.2:
         raise ValueError(f"no cage with about {target} tets, but {len(best[1])}, in {FILL_CALLS} calls")
     return best

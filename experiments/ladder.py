@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import hashlib
 import json
+import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from nimpostor_jax.pipeline.bake import bake
 from nimpostor_jax.pipeline.curve import HeldOutCurve
 from nimpostor_jax.pipeline.evaluate import camera_of, evaluate, picture_name, write_json
 from nimpostor_jax.pipeline.fit import fit
-from nimpostor_jax.pipeline.prepare import Scene, prepare
+from nimpostor_jax.pipeline.prepare import Scene, check_built, prepare, settings_of
 from nimpostor_jax.preprocess.cage import cage_from_images
 from nimpostor_jax.render.frame import frame_config, render_frame, to_image
 from nimpostor_jax.render.raster_frame import rasterize_frame
@@ -62,21 +63,29 @@ class Trained(NamedTuple):
     row: Row
 
 
+def scene_name(data: str) -> str:
+    """A scene's folder's own name, of `.` and `..` too."""
+    return Path(os.path.abspath(data)).name
+
+
 def cage_of(data: str, given: Path | None, folder: Path, config: ExperimentConfig, quick: bool) -> Path:
     """Where the cage of all of a scene's methods is: the given file, or one in `folder`, built if need be.
 
     An envelope, of which NGP-Bounded takes the bounding box; that of a quick run is apart. Raises
-    FileNotFoundError for a given file that is not there.
+    FileNotFoundError for a given file that is not there, ValueError for one that was built otherwise.
     """
     if given is not None:
         if not given.is_file():
             raise FileNotFoundError(f"cage {given} does not exist; without --cage one is built")
         return given
     path = (folder / f"{QUICK_RESOLUTION}" if quick else folder) / "cage.npz"
-    if not path.exists():
+    envelope = dataclasses.replace(config.cage, shape="envelope")
+    if path.exists():
+        check_built(path, envelope)
+    else:
         train, _ = load_scene(resolve_scene(data), config.data)
         check_masks(train)
-        save_tets(path, *cage_from_images(train, dataclasses.replace(config.cage, shape="envelope")))
+        save_tets(path, *cage_from_images(train, envelope), settings_of(envelope))
     return path
 
 
@@ -101,9 +110,9 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
     # Training knows nothing of these, and what uses the run may have other defaults by then.
     lines = operative_config_text(config).splitlines(keepends=True)
     text = "".join(line for line in lines if not line.startswith(("BakeConfig.", "RetrainConfig.")))
-    mesh, views = scene.impostor.mesh, scene.train
-    cameras = views.camera_to_world, views.focal, views.principal
-    _claim(workdir, text, mesh.vertices, mesh.tets, mesh.center, mesh.scale, views.images, *cameras)
+    mesh = scene.impostor.mesh
+    pictures = [array for views in (scene.train, scene.test) for array in _content(views)]
+    _claim(workdir, text, mesh.vertices, mesh.tets, mesh.center, mesh.scale, *pictures)
     if row_file.exists():
         print(f"{workdir}: trained already")
         return Trained(scene, load_impostor(file), json.loads(row_file.read_text(encoding="utf-8")))
@@ -116,7 +125,7 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
         seconds = {int(line["step"]): float(line["seconds"]) for line in csv.DictReader(log)}
     row = {
         "method": method,
-        "scene": Path(data).name,
+        "scene": scene_name(data),
         "psnr": result["psnr"],
         "ssim": result["ssim"],
         "lpips": result["lpips"],
@@ -132,6 +141,11 @@ def train_or_reuse(method: str, config: ExperimentConfig, data: str, cage: Path,
     write_json(row_file, row)
     forget_programs()
     return Trained(scene, impostor, row)
+
+
+def _content(views: PosedImages) -> list[np.ndarray]:
+    pictures = [views.images] if views.backgrounds is None else [views.images, views.backgrounds]
+    return [*pictures, views.camera_to_world, views.focal, views.principal]
 
 
 def _claim(workdir: Path, settings: str, *arrays: Any) -> None:

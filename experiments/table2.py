@@ -20,10 +20,10 @@ from ladder import (
     QUICK,
     QUICK_RESOLUTION,
     Row,
-    Trained,
     bake_or_reuse,
     cage_of,
     config_of,
+    scene_name,
     seconds_to,
     train_or_reuse,
     write_picture,
@@ -73,7 +73,7 @@ def main(argv: Sequence[str]) -> None:
         raise ValueError(f"{len(args.cage)} cages for {len(args.scene)} scenes; give one each, or none")
     use_all_cores()
     bindings = [*(QUICK if args.quick else ()), *args.gin_bindings]
-    folders = [args.out / Path(scene).name for scene in args.scene]
+    folders = [args.out / scene_name(scene) for scene in args.scene]
     if len(set(folders)) < len(folders):
         raise ValueError(f"scenes need folders of different names, got {args.scene}")
     resolutions = [QUICK_RESOLUTION] if args.quick else args.resolution
@@ -81,28 +81,39 @@ def main(argv: Sequence[str]) -> None:
     given = args.cage or [None] * len(folders)
     cages = [cage_of(*each, config, args.quick) for each in zip(args.scene, given, folders, strict=True)]
     rows: list[Row] = []
+    refused: list[str] = []
     for scene, folder, cage in zip(args.scene, folders, cages, strict=True):
         for resolution in resolutions:
             place = folder / f"{resolution}"
-            trained = []
+            of_scene: list[Row] = []
             for method in args.methods:
                 config = config_of(method, resolution, args.gin_configs, bindings)
-                trained.append(train_or_reuse(method, config, scene, cage, place / method))
-            known = rows + compared(trained)  # a baking may be refused
+                trained = train_or_reuse(method, config, scene, cage, place / method)
+                of_scene.append(trained.row)
+                if method == "FeatInt":
+                    source = trained
+            views = trained.scene.test
+            del trained  # pictures and pixels, which baking needs the memory of
+            known = rows + compared(of_scene)
             write_table(args.out / "table2", known, COLUMNS, notes(known))
             if "FeatInt" in args.methods and not args.no_bake:
-                source = trained[args.methods.index("FeatInt")]
-                baked, row = bake_or_reuse(source, place / "Baked")
-                trained.append(source._replace(impostor=baked, row=row))
-            rows += compared(trained)
-            runs = [place / each.row["method"] for each in trained]
-            write_picture(folder / f"{resolution}.png", trained[0].scene.test, runs)
+                try:
+                    of_scene.append(bake_or_reuse(source, place / "Baked")[1])
+                except ValueError as error:  # of this scene: the others need not wait
+                    refused.append(f"{scene} at {resolution}: {error}")
+                    print(f"no row of {refused[-1]}")
+                del source
+            rows += compared(of_scene)
+            runs = [place / row["method"] for row in of_scene]
+            write_picture(folder / f"{resolution}.png", views, runs)
             write_table(args.out / "table2", rows, COLUMNS, notes(rows))
+    if refused:
+        raise ValueError(f"{len(refused)} of the baked rows are missing; {'; '.join(refused)}")
 
 
-def compared(trained: Sequence[Trained]) -> list[Row]:
+def compared(rows: Sequence[Row]) -> list[Row]:
     """The methods' rows, beside the paper's and with their training times against NGP-Bounded's."""
-    rows = [dict(each.row) for each in trained]
+    rows = [dict(row) for row in rows]
     furry = any(name in rows[0]["scene"] for name in ("plush", "fluffy"))
     paper = PAPER["plush" if furry else "nerf-synthetic"]
     curves = {row["method"]: row["curve"] for row in rows if row.get("curve")}

@@ -2,6 +2,7 @@
 
 import importlib
 import importlib.util
+import json
 import sys
 from functools import partial
 from pathlib import Path
@@ -12,8 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from nimpostor_jax.config import MarchConfig
+from nimpostor_jax.config import CageConfig, MarchConfig
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
+from nimpostor_jax.preprocess.visual_hull import OccupancyGrid
 
 EXPERIMENTS = Path(__file__).resolve().parents[1] / "experiments"
 
@@ -227,3 +229,56 @@ def test_a_loose_cage_draws_more_rays_so_that_as_many_show_the_object():
     for half_size, expected in [(10.0, 6400), (1.0, 128)]:  # 100 times 256 / 4, and 100, in steps of 64
         cage = box_tets(np.array([[-half_size] * 3, [half_size] * 3]))
         assert figure10.rays_per_batch(cage, views, 100) == expected
+
+
+def test_a_refused_baking_costs_its_own_row_alone(monkeypatch, tmp_path):
+    table2, ladder = (importlib.import_module(name) for name in ("table2", "ladder"))
+
+    def train(method, config, scene, cage, workdir):
+        row = {"method": method, "scene": Path(scene).name, "psnr": 30.0, "steps": 1, "rays_per_batch": 1}
+        return ladder.Trained(SimpleNamespace(test=None), None, row)
+
+    def bake(source, workdir):
+        if source.row["scene"] == "furry":
+            raise ValueError("3310 MB")
+        return None, {**source.row, "method": "Baked"}
+
+    for name, stand_in in [
+        ("cage_of", lambda *_: None),
+        ("train_or_reuse", train),
+        ("bake_or_reuse", bake),
+        ("write_picture", lambda *_: None),
+        ("use_all_cores", lambda: None),
+    ]:
+        monkeypatch.setattr(table2, name, stand_in)
+    methods = ["NGP-Bounded", "FeatInt"]
+    with pytest.raises(ValueError, match=r"1 of the baked rows .*furry at 24: 3310 MB"):
+        table2.main(["--scene", "furry", "smooth", f"--out={tmp_path}", "--quick", "--methods", *methods])
+    rows = json.loads((tmp_path / "table2.json").read_text())["rows"]
+    assert [row["method"] for row in rows] == [*methods, *methods, "Baked"]
+
+
+def test_a_runs_claim_knows_the_held_out_pictures(tmp_path):
+    ladder = importlib.import_module("ladder")
+    ladder._claim(tmp_path, "a = 1\n", np.zeros(3), np.ones(2))
+    ladder._claim(tmp_path, "a = 1\n", np.zeros(3), np.ones(2))
+    with pytest.raises(ValueError, match="its cage, pictures or field"):
+        ladder._claim(tmp_path, "a = 1\n", np.zeros(3), np.zeros(2))
+    views = SimpleNamespace(images=1, backgrounds=2, camera_to_world=3, focal=4, principal=5)
+    assert sorted(ladder._content(views)) == [1, 2, 3, 4, 5]
+
+
+def test_proxies_lie_as_far_off_the_object_as_asked_for(monkeypatch):
+    """However the hull lies in its array of voxels."""
+    figure10 = importlib.import_module("figure10")
+    occupied = np.zeros((16, 16, 16), bool)
+    occupied[5:15, 3:9, 1:5] = True
+    hull = OccupancyGrid(occupied, np.array([1.0, 2, 3]), 0.1)
+    monkeypatch.setattr(figure10, "visual_hull", lambda *_, **__: hull)
+    views = SimpleNamespace(masks=None, camera_to_world=None, focal=None, principal=None, names=None)
+    vertices, tets = figure10.proxy_cage("box", views, CageConfig(margin=0.05))
+    # Held are the centres of the voxels, half of one within the bounds.
+    gap = 0.05 * np.linalg.norm(np.diff(hull.bounds, axis=0)) - 0.05
+    expected = hull.bounds + gap * np.array([[-1], [1]])
+    np.testing.assert_allclose([vertices.min(axis=0), vertices.max(axis=0)], expected, atol=1e-9)
+    assert len(tets) == 6

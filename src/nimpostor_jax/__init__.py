@@ -25,6 +25,7 @@ _MODULES = {
         "BakedImpostor",
         "Camera",
         "FunctionSolid",
+        "GridSolid",
         "NeuralImpostor",
         "Rays",
         "RenderOutput",
@@ -40,6 +41,7 @@ _MODULES = {
     "field.impostor": ("init_impostor",),
     "geometry.locate": ("locate",),
     "gin_flags": ("load_config",),
+    "io.blender": ("PosedImages", "load_scene"),
     "io.impostor_file": ("load_baked", "load_impostor", "save_impostor"),
     "pipeline.bake": ("bake",),
     "pipeline.evaluate": ("camera_of", "evaluate", "orbit"),
@@ -53,7 +55,16 @@ _MODULES = {
     "render.frame": ("for_frames", "frame_config", "render_frame", "to_image"),
     "render.raster_frame": ("rasterize_frame",),
     "render.renderer": ("render_rays",),
-    "train.step": ("train_step",),
+    "train.pool": ("draw_batch",),
+    "train.step": (
+        "RayBatch",
+        "TrainState",
+        "init_state",
+        "make_optimizer",
+        "train_step",
+        "trainable",
+        "with_parameters",
+    ),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 __all__ = sorted(_HOME)

@@ -87,7 +87,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="CLASS.FIELD=VALUE",
-        help="bindings that override the files', e.g. --gin_bindings='TrainConfig.steps=500'",
+        help="bindings that override the files', e.g. TrainConfig.steps=500 TrainConfig.seed=1",
     )
     parser.add_argument(
         "--traceback",

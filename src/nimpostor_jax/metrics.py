@@ -15,7 +15,7 @@ from skimage.metrics import structural_similarity
 
 from nimpostor_jax.lpips import LpipsWeights, lpips_distance, read_weights
 
-_SSIM_WINDOW = 11  # pixels: a Gaussian of sigma 1.5 cut at 3.5 sigma
+SSIM_MIN_SIDE = 11  # pixels: a Gaussian of sigma 1.5 cut at 3.5 sigma
 
 
 def psnr(a: ArrayLike, b: ArrayLike) -> float:
@@ -39,9 +39,9 @@ def ssim(a: ArrayLike, b: ArrayLike) -> float:
     first, second = _checked_pair(a, b, "ssim")
     if first.ndim != 3:
         raise ValueError(f"ssim compares pictures [H, W, C], got shape {first.shape}")
-    if min(first.shape[:2]) < _SSIM_WINDOW:
+    if min(first.shape[:2]) < SSIM_MIN_SIDE:
         raise ValueError(
-            f"ssim needs at least {_SSIM_WINDOW}x{_SSIM_WINDOW} pixels, got shape {first.shape}"
+            f"ssim needs at least {SSIM_MIN_SIDE}x{SSIM_MIN_SIDE} pixels, got shape {first.shape}"
         )
     value = structural_similarity(
         first,

@@ -81,7 +81,7 @@ class TetSegments:
 
 @struct.dataclass
 class HashLayout:
-    """Which table entries a tet's grid nodes own (`paper/notes`: per_tet and per_simplex).
+    """Which table entries a tet's grid nodes own (`docs/choices.md`, Encoding: per_tet and per_simplex).
 
     `regions[l, t, m]` packs offset * 32 + log2(size) of the region of level l in which tet t keeps the nodes
     whose set of nonzero coordinates is the 4-bit mask m (one column where all masks share a region).

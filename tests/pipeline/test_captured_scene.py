@@ -34,6 +34,22 @@ def photographs(tmp_path_factory):
     return write_capture(tmp_path_factory.mktemp("data"), views, STAY, lens={})
 
 
+def test_many_large_photographs_are_reduced_for_memory(photographs, tmp_path, monkeypatch):
+    lines = []
+    monkeypatch.setattr(capture, "_MAX_PIXELS", 100 * 40 * 40)
+    folder, _ = make_scene(photographs, tmp_path / "small", ExperimentConfig(), log=lines.append)
+    assert any("100 images of 50 x 50 are reduced to 40 pixels" in line for line in lines)
+    small = load_blender(folder, "train")
+    assert small.images.shape[1:3] == (40, 40)
+    asked = ExperimentConfig(data=DataConfig(resolution=50))
+    folder, _ = make_scene(photographs, tmp_path / "large", asked, log=quiet)
+    large = load_blender(folder, "train")
+    assert large.images.shape[1:3] == (50, 50)
+    assert_allclose(small.focal / 40, large.focal / 50)
+    assert_allclose(small.principal / 40, large.principal / 50)
+    assert_allclose(small.images.mean(axis=(1, 2)), large.images.mean(axis=(1, 2)), atol=0.003)  # 8 bits
+
+
 def test_the_dataset_folder_is_whole_and_knows_its_backgrounds(photographs, tmp_path):
     config = ExperimentConfig()
     folder, region = make_scene(photographs, tmp_path / "work", config, log=quiet)

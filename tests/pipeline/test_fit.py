@@ -17,7 +17,7 @@ from nimpostor_jax.metrics import psnr
 from nimpostor_jax.pipeline import fit as fit_module
 from nimpostor_jax.pipeline.curve import HeldOutCurve
 from nimpostor_jax.pipeline.evaluate import MAX_PSNR, evaluate, orbit, picture_name, vertical
-from nimpostor_jax.pipeline.fit import Progress, fit
+from nimpostor_jax.pipeline.fit import Progress, _fingerprint, fit
 from nimpostor_jax.pipeline.prepare import prepare
 from nimpostor_jax.render.frame import _render_sharded
 
@@ -242,6 +242,20 @@ def test_views_are_compared_over_their_own_backgrounds(scene):
     found = evaluate(clear, views, scene.config.render, log=lambda _: None)["psnr"]
     wrong = np.mean(np.square(opaque[..., :3] - behind))
     assert found == pytest.approx(-10 * np.log10(wrong), abs=1e-3)
+
+
+def test_pictures_too_small_for_a_metric_have_none_of_it(scene):
+    views = scene.test.select([0])
+    low = dataclasses.replace(views, images=views.images[:, :8])
+    result = evaluate(cleared(scene.impostor), low, scene.config.render, log=lambda _: None)
+    assert result["ssim"] is None and result["lpips"] is None
+    assert np.isfinite(result["psnr"])
+
+
+def test_other_backgrounds_are_other_pictures(scene):
+    views = dataclasses.replace(scene.train, backgrounds=np.zeros_like(scene.train.images[..., :3]))
+    other = dataclasses.replace(views, backgrounds=views.backgrounds + 1)
+    assert len({_fingerprint(each) for each in (scene.train, views, other)}) == 3
 
 
 def test_the_vertical_is_the_cameras_own(scene):

@@ -8,15 +8,18 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import pdist
 
-from nimpostor_jax.config import ExperimentConfig
+from nimpostor_jax.config import CageConfig, ExperimentConfig
 from nimpostor_jax.gin_flags import load_config
+from nimpostor_jax.io.mesh_files import save_tets
 from nimpostor_jax.pipeline import prepare as prepare_module
 from nimpostor_jax.pipeline.prepare import (
     SMALL_LOOPS,
+    check_built,
     fit_levels,
     load_cage,
     pixels_per_edge,
     prepare,
+    settings_of,
     use_all_cores,
 )
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
@@ -42,6 +45,9 @@ def test_edges_count_by_the_volume_of_their_tets():
     lengths = np.concatenate([pdist(vertices[tet]) for tet in tets])
     expected = np.median(lengths) * 100 / 4
     assert pixels_per_edge(vertices, tets, views) == pytest.approx(expected)
+
+    stray = np.concatenate([vertices, [[99.0, 99, 99]]])  # of no tet
+    assert pixels_per_edge(stray, tets, views) == pytest.approx(expected)
 
     skin = np.concatenate([vertices, *[center + 0.01 * (vertices - center)] * 9])
     many = np.concatenate([tets + len(vertices) * i for i in range(10)])
@@ -79,3 +85,15 @@ def test_a_step_that_is_not_known_is_asked_for_before_anything_is_read():
     config = load_config(bindings=["SamplerConfig.measure='euclidean'"])
     with pytest.raises(ValueError, match=r"SamplerConfig\.step must be given"):
         prepare(config, "no/such/folder")
+
+
+def test_a_built_cage_is_taken_again_with_its_own_settings_alone(tmp_path):
+    own, path = CageConfig(target_tets=100), tmp_path / "cage.npz"
+    cage = box_tets(np.array([[0.0, 0, 0], [1, 1, 1]]))
+    save_tets(path, *cage, settings_of(own))
+    check_built(path, own)
+    config = ExperimentConfig(cage=CageConfig(target_tets=300))
+    with pytest.raises(ValueError, match=r"cage\.npz was built with CageConfig.target_tets = 100, not 300"):
+        prepare(config, "nowhere", cage=path, cage_output=path)  # before anything else is read
+    save_tets(path, *cage)  # from elsewhere
+    check_built(path, own)

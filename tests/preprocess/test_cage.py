@@ -46,6 +46,13 @@ def test_cage_from_images_contains_the_object_and_prints_its_report():
     assert "dihedral angles" in lines[-1] and "0.0000%" in lines[-1]
 
 
+def test_a_box_stays_the_bounding_box():
+    vertices, tets = cage_from_images(views_of([((0.1, 0, 0), 0.5)]), CageConfig(shape="box"), lambda _: None)
+    expected, same = box_tets(np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
+    np.testing.assert_array_equal(vertices, expected)  # or a run that goes on would have another
+    np.testing.assert_array_equal(tets, same)
+
+
 def test_an_empty_mask_stops_before_any_meshing():
     views = views_of([((0, 0, 0), 0.5)], count=6, side=32)
     views.images[3] = 0

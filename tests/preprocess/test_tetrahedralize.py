@@ -138,7 +138,7 @@ def test_tightening_keeps_the_points_and_loses_volume():
 def test_tets_on_one_side_of_a_face_are_not_sound():
     """As fTetWild's inverted ones are after they were turned around: it is to try again."""
     vertices, tets = box_tets(np.array([[0.0] * 3, [1.0] * 3]))
-    assert module._is_sound(vertices, tets)
+    assert module.is_sound(vertices, tets)
     inner = np.concatenate([vertices, [[0.5, 0.6, 0.7]]])
     beside = orient_tets(np.append(tets[0, :3], 8)[None], inner)
-    assert not module._is_sound(inner, np.concatenate([tets[:1], beside]))
+    assert not module.is_sound(inner, np.concatenate([tets[:1], beside]))

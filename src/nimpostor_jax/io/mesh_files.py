@@ -1,11 +1,13 @@
 """Tetrahedral cages and triangle surfaces on disk.
 
-Cages: `.npz` with `V` float64 [n, 3] and `T` int32 [m, 4]; `.vtk`, `.vtu`, `.msh` through meshio
-(tetra cells only). Surfaces: whatever trimesh reads. World units throughout.
+Cages: `.npz` with `V` float64 [n, 3] and `T` int32 [m, 4], and of built ones `settings`, a text;
+`.vtk`, `.vtu`, `.msh` through meshio (tetra cells only). Surfaces: whatever trimesh reads.
+World units throughout.
 """
 
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -43,9 +45,14 @@ def load_tets(
 
 
 def save_tets(
-    path: str | Path, vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]
+    path: str | Path,
+    vertices: Float[np.ndarray, "V 3"],
+    tets: Int[np.ndarray, "T 4"],
+    settings: str | None = None,
 ) -> None:
     """Write a cage in the format that the suffix names; the file appears whole or not at all.
+
+    `settings` is what it was built with, for `cage_settings`; only `.npz` keeps it.
 
     Raises:
         ValueError: unknown suffix, or a mesh that fails `preprocess.validate.check_tets`.
@@ -56,10 +63,18 @@ def save_tets(
     vertices, tets = np.asarray(vertices, np.float64), np.asarray(tets, np.int32)
     with atomic_path(path) as partial:
         if path.suffix == ".npz":
-            np.savez(partial, V=vertices, T=tets)
+            more: dict[str, Any] = {} if settings is None else {"settings": np.array(settings)}
+            np.savez(partial, V=vertices, T=tets, **more)
         else:
             mesh = meshio.Mesh(vertices, [("tetra", tets)])
             mesh.write(partial, file_format=_MESHIO_FORMATS[path.suffix])
+
+
+def cage_settings(path: str | Path) -> str | None:
+    """What an `.npz` cage says that it was built with; None where it does not. Errors as `load_tets`."""
+    check_exists(Path(path), "cage")
+    settings = _arrays(Path(path)).get("settings")
+    return None if settings is None else str(settings)
 
 
 def check_cage_path(path: Path) -> None:
@@ -72,15 +87,19 @@ def check_cage_path(path: Path) -> None:
         )
 
 
-def _read_npz(path: Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 4"]]:
+def _arrays(path: Path) -> dict[str, np.ndarray]:
     # Zip archives only: NumPy takes anything else for a lone array or a pickle.
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path}: not an .npz archive (damaged?); write it with save_tets")
     try:
         with np.load(path, allow_pickle=False) as data:
-            arrays = dict(data)
+            return dict(data)
     except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path}: unreadable arrays ({error}); write it with save_tets") from error
+
+
+def _read_npz(path: Path) -> tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "T 4"]]:
+    arrays = _arrays(path)
     missing = [key for key in ("V", "T") if key not in arrays]
     if missing:
         raise ValueError(

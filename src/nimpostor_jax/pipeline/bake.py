@@ -325,6 +325,6 @@ def face_pixels(
             f"{len(flat)} faces have no area; first: that of tet {flat[0, 0]} opposite corner {flat[0, 1]}; "
             "remesh the cage"
         )
-    middle = vertices.mean(axis=0)
+    middle = vertices[np.unique(tets)].mean(axis=0)
     distance = np.median(np.linalg.norm(views.camera_to_world[:, :3, 3] - middle, axis=1))
     return np.linalg.norm(edges, axis=-1).max(axis=-1) * np.median(views.focal) / distance

@@ -44,6 +44,8 @@ from nimpostor_jax.train.pool import PixelPool
 from nimpostor_jax.types import NeuralImpostor
 
 RECORD = "capture.json"  # in the dataset folder: where it came from
+# Of all pictures together. Training holds 28 bytes of each, and 50 more of those that meet the cage.
+_MAX_PIXELS = 100_000_000
 _SURROUNDINGS_WIDTH = 256  # pixels of the pictures from which the surroundings are read
 _LOOK = 16  # pixels between the rays that look for the region
 _SEARCH_VOXELS = 64  # along the region, while the object's box is sought
@@ -88,7 +90,9 @@ def make_scene(
         )
     capture = read_capture(data, workdir, log)
     crops, width, height = common_crops(capture, log)
-    if config.data.resolution is not None and config.data.resolution > width:
+    if config.data.resolution is None:
+        width, height = affordable_size(width, height, len(capture.paths), log)
+    elif config.data.resolution > width:
         raise ValueError(
             f"DataConfig.resolution = {config.data.resolution}, but what all undistorted images have in "
             f"common is {width} pixels wide; lower it"
@@ -116,6 +120,19 @@ def make_scene(
         bounds = {"bounds": region.bounds.tolist(), "is_ball": region.is_ball}
         write_json(partial / RECORD, asked | bounds)
     return folder, region
+
+
+def affordable_size(width: int, height: int, count: int, log: Log = print) -> tuple[int, int]:
+    """The size of so many pictures, all of which training holds in memory: `_MAX_PIXELS` at most."""
+    share = _MAX_PIXELS / (width * height * count)
+    if share >= 1:
+        return width, height
+    small = max(1, int(width * share**0.5))
+    log(
+        f"{count} images of {width} x {height} are reduced to {small} pixels in width, for memory; "
+        "DataConfig.resolution asks for another"
+    )
+    return small, max(1, round(height * small / width))
 
 
 def box_region(box: Sequence[float]) -> Region:

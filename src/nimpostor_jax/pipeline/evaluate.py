@@ -39,7 +39,9 @@ def evaluate(
     pictures: str | Path | None = None,
     log: Log = print,
 ) -> dict[str, Any]:
-    """PSNR, SSIM and LPIPS (None without the extra `lpips`) on views, mean and per view; seconds a frame.
+    """PSNR, SSIM and LPIPS on views, mean and per view; seconds a frame.
+
+    SSIM and LPIPS are None of pictures that are too small for them, LPIPS also without the extra `lpips`.
 
     PSNR is `MAX_PSNR` at most. Truth and render stand over the view's own background where it has one, else
     over `background`. With `pictures`, writes `<view>.png` there: truth, render, error times 4, depth. The
@@ -61,7 +63,7 @@ def evaluate(
             {
                 "view": name,
                 "psnr": min(metrics.psnr(image, truth), MAX_PSNR),
-                "ssim": metrics.ssim(image, truth),
+                "ssim": metrics.ssim(image, truth) if min(image.shape[:2]) >= metrics.SSIM_MIN_SIDE else None,
                 "lpips": metrics.lpips(image, truth) if min(image.shape[:2]) >= LPIPS_MIN_SIDE else None,
             }
         )
@@ -77,9 +79,9 @@ def evaluate(
         key: _mean([view[key] for view in per_view]) for key in ("psnr", "ssim", "lpips")
     }
     result |= {"seconds_per_frame": float(np.median(seconds)), "per_view": per_view}
-    lpips = "none (see metrics.lpips)" if result["lpips"] is None else f"{result['lpips']:.4f}"
+    ssim, lpips = ("none" if result[key] is None else f"{result[key]:.4f}" for key in ("ssim", "lpips"))
     log(
-        f"{len(views)} views: PSNR {result['psnr']:.2f} dB, SSIM {result['ssim']:.4f}, LPIPS {lpips}, "
+        f"{len(views)} views: PSNR {result['psnr']:.2f} dB, SSIM {ssim}, LPIPS {lpips}, "
         f"{result['seconds_per_frame']:.2f} s a frame"
     )
     return result

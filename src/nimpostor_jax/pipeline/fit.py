@@ -119,6 +119,7 @@ def fit(
     )
     compiled = jax.jit(step_function, static_argnames="config", donate_argnums=0)
     update = jax.jit(partial(update_thickness, sampler=render.sampler), donate_argnums=1)
+    has_updated = False
     key = jax.random.key(config.seed + 1)
     records = _LogFile(Path(workdir) / "log.csv" if workdir is not None else None, progress.step)
     bar = tqdm(
@@ -141,6 +142,10 @@ def fit(
             batch = place(drawn)
             if config.occupancy == "density" and progress.step % _OCCUPANCY_EVERY == 0:
                 state = update(key, state, impostor)
+                if not has_updated and clock is not None:  # a resumed run's first one, which compiles
+                    jax.block_until_ready(state)
+                    clock = time.perf_counter()
+                has_updated = True
             rate = learning_rate(config, done, progress.step)
             state, metrics = compiled(state, impostor, batch, jnp.asarray(rate, jnp.float32), config=render)
             progress.step += 1
@@ -184,7 +189,9 @@ _OCCUPANCY_EVERY = 16  # steps, as in Instant-NGP
 def _fingerprint(views: PosedImages) -> str:
     """Identifies training views by their cameras and every fourth pixel of every fourth row."""
     digest = hashlib.sha256()
-    for values in (views.images[:, ::4, ::4], views.camera_to_world, views.focal, views.principal):
+    pictures = [views.images] if views.backgrounds is None else [views.images, views.backgrounds]
+    thinned = [each[:, ::4, ::4] for each in pictures]
+    for values in (*thinned, views.camera_to_world, views.focal, views.principal):
         digest.update(np.ascontiguousarray(values, "<f4").tobytes())
     return digest.hexdigest()[:16]
 

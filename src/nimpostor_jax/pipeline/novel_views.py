@@ -32,23 +32,27 @@ def with_novel_views(
     if views.backgrounds is not None:  # colours of all kinds, so that what is opaque shows
         plain = rng.uniform(size=(count, 1, 1, 3)).astype(views.backgrounds.dtype)
         backgrounds = np.broadcast_to(plain, (count, *size, 3))
-    cameras = PosedImages(
-        images=np.zeros((count, *size, 4), views.images.dtype),
-        camera_to_world=poses,
-        focal=views.focal[lenses],
-        principal=views.principal[lenses],
-        names=tuple(f"between_{i}" for i in range(count)),
-        has_alpha=np.full(count, backgrounds is None),
+        backgrounds = np.concatenate([views.backgrounds, backgrounds])
+    first = len(views)
+    images = np.empty((first + count, *size, 4), views.images.dtype)
+    images[:first] = views.images
+    both = PosedImages(
+        images=images,
+        camera_to_world=np.concatenate([views.camera_to_world, poses]),
+        focal=np.concatenate([views.focal, views.focal[lenses]]),
+        principal=np.concatenate([views.principal, views.principal[lenses]]),
+        names=views.names + tuple(f"between_{i}" for i in range(count)),
+        has_alpha=np.concatenate([views.has_alpha, np.full(count, backgrounds is None)]),
         backgrounds=backgrounds,
     )
-    sized = frame_config(impostor, camera_of(cameras, 0), config)
-    for i in tqdm(range(count), desc="novel views", unit="view", disable=None):
-        frame = render_frame(impostor, camera_of(cameras, i), sized)
-        cameras.images[i] = np.concatenate([frame.color, frame.opacity[..., None]], axis=-1)
-        if cameras.backgrounds is not None:
-            cameras.images[i, ..., :3] += (1 - frame.opacity[..., None]) * cameras.backgrounds[i]
-            cameras.images[i, ..., 3] = 1
-    return joined(views, cameras)
+    sized = frame_config(impostor, camera_of(both, first), config)
+    for i in tqdm(range(first, first + count), desc="novel views", unit="view", disable=None):
+        frame = render_frame(impostor, camera_of(both, i), sized)
+        images[i] = np.concatenate([frame.color, frame.opacity[..., None]], axis=-1)
+        if backgrounds is not None:
+            images[i, ..., :3] += (1 - frame.opacity[..., None]) * backgrounds[i]
+            images[i, ..., 3] = 1
+    return both
 
 
 def poses_between(
@@ -75,19 +79,3 @@ def poses_between(
         pose[:3, 3] = weights @ places[chosen]
         pose[:3, :3] = Rotation.from_matrix(rotations[chosen]).mean(weights).as_matrix()
     return poses
-
-
-def joined(first: PosedImages, second: PosedImages) -> PosedImages:
-    """The views of both, of one size."""
-    backgrounds = None
-    if first.backgrounds is not None and second.backgrounds is not None:
-        backgrounds = np.concatenate([first.backgrounds, second.backgrounds])
-    return PosedImages(
-        images=np.concatenate([first.images, second.images]),
-        camera_to_world=np.concatenate([first.camera_to_world, second.camera_to_world]),
-        focal=np.concatenate([first.focal, second.focal]),
-        principal=np.concatenate([first.principal, second.principal]),
-        names=first.names + second.names,
-        has_alpha=np.concatenate([first.has_alpha, second.has_alpha]),
-        backgrounds=backgrounds,
-    )

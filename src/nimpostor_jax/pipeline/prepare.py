@@ -2,6 +2,7 @@
 
 import ctypes
 import dataclasses
+import json
 import os
 import warnings
 from collections.abc import Callable
@@ -11,11 +12,12 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from nimpostor_jax.config import ExperimentConfig, RenderConfig
+from nimpostor_jax.config import CageConfig, ExperimentConfig, RenderConfig
+from nimpostor_jax.config_dict import to_dict
 from nimpostor_jax.field.impostor import init_impostor
 from nimpostor_jax.geometry.topology import build_tet_mesh, world_vertices
 from nimpostor_jax.io.blender import PosedImages, check_masks, load_scene
-from nimpostor_jax.io.mesh_files import load_tets, save_tets
+from nimpostor_jax.io.mesh_files import cage_settings, load_tets, save_tets
 from nimpostor_jax.io.scenes import resolve_scene
 from nimpostor_jax.preprocess.cage import Cage, cage_from_images
 from nimpostor_jax.preprocess.tetrahedralize import box_tets
@@ -115,6 +117,8 @@ def prepare(
     with_step(config.render, config.impostor.encoding)  # asks for a step where there must be one
     if cage is not None:
         load_tets(cage)  # before pictures are decoded
+        if cage_output is not None and Path(cage) == Path(cage_output):  # an earlier run's own
+            check_built(cage, config.cage)
     train, test = load_scene(resolve_scene(data), config.data)
     log(f"{data}: {len(train)} training views, {len(test)} test views, {train.width} x {train.height}")
     built = load_cage(config, train, cage, cage_output, log)
@@ -176,7 +180,8 @@ def pixels_per_edge(
 
     Samples are where volume is: of many cages most tets make a skin of small ones.
     """
-    distances = np.linalg.norm(views.camera_to_world[:, :3, 3] - vertices.mean(axis=0), axis=1)
+    center = vertices[np.unique(tets)].mean(axis=0)  # a file may have points that no tet uses
+    distances = np.linalg.norm(views.camera_to_world[:, :3, 3] - center, axis=1)
     pixel = np.median(distances) / np.median(views.focal)
     edges = edge_lengths(vertices, tets).reshape(-1)
     order = np.argsort(edges)
@@ -216,6 +221,22 @@ def load_cage(
         if not (same and np.allclose(of_run[0], vertices)):
             raise ValueError(f"{cage_output} is another cage than {cage}; remove it or use another folder")
     elif cage_output is not None:
-        save_tets(cage_output, vertices, tets)
+        save_tets(cage_output, vertices, tets, settings_of(config.cage) if cage is None else None)
         log(f"cage saved as {cage_output}")
     return vertices, tets
+
+
+def settings_of(config: CageConfig) -> str:
+    """What the file of a cage that was built says of itself (`save_tets`)."""
+    return json.dumps(to_dict(config))
+
+
+def check_built(path: str | Path, config: CageConfig) -> None:
+    """Raise ValueError where a cage was built with other settings; cages from elsewhere do not say."""
+    there = json.loads(cage_settings(path) or "{}")
+    for name, value in to_dict(config).items():
+        if there.get(name, value) != value:
+            raise ValueError(
+                f"{path} was built with CageConfig.{name} = {there[name]!r}, not {value!r}; "
+                "remove it, or use another folder"
+            )

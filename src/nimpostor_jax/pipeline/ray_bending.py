@@ -47,10 +47,11 @@ class BentField:
             )
         if rest.shape != moved.shape:
             raise ValueError(f"{len(rest)} vertices at rest, {len(moved)} moved: not the same cage")
-        self._impostor, self._rest, self._tets = impostor, np.asarray(rest, np.float64), np.asarray(tets)
-        self._moved = np.asarray(moved, np.float64)
+        used, tets = np.unique(tets, return_inverse=True)  # a file may have vertices that no tet uses
+        self._impostor, self._tets = impostor, tets.reshape(-1, 4)
+        self._rest, self._moved = (np.asarray(places, np.float64)[used] for places in (rest, moved))
         self._tree = cKDTree(self._moved)
-        self._around = _tets_around(self._tets, len(rest))
+        self._around = _tets_around(self._tets, len(used))
         corners = self._moved[self._tets]
         self._first = corners[:, 0]
         edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)

@@ -143,7 +143,8 @@ def _build(
             margin,
             log,
         )
-        vertices = tighten(vertices, tets, _required_points(grid, _TIGHT_SHARE * margin * diagonal))
+        if config.shape != "box":  # whose corners nothing holds in place
+            vertices = tighten(vertices, tets, _required_points(grid, _TIGHT_SHARE * margin * diagonal))
         validate.check_tets(vertices, tets, source)
         report = validate.quality_report(vertices, tets)
         missed = coverage((vertices, tets))

@@ -86,7 +86,7 @@ def tetrahedralize(
         surface = envelope(offset, _STEP * offset)
         vertices, tets = run_ftetwild(surface, epsilon * diagonal, edge)
         log(f"fTetWild call {call + 1} (<= {MAX_CALLS}): epsilon {epsilon:.4f}, {len(tets)} tets")
-        if len(tets) and _is_sound(vertices, tets):
+        if len(tets) and is_sound(vertices, tets):
             attempts.append(_Attempt(epsilon, vertices, tets))
             if attempts[-1].error(target_tets) <= _CLOSE_ENOUGH:
                 break
@@ -153,7 +153,7 @@ def box_tets(
     return vertices, orient_tets(tets, vertices)
 
 
-def _is_sound(vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]) -> bool:
+def is_sound(vertices: Float[np.ndarray, "V 3"], tets: Int[np.ndarray, "T 4"]) -> bool:
     """No tet without volume, none beside another on one side of a face, a closed boundary without seams."""
     size = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     if signed_volumes(vertices, tets).min() <= 1e-10 * size**3:
