@@ -32,7 +32,8 @@ def test_faces_without_area_are_named():
 
 def test_lengths_are_in_pixels():
     pixels = face_pixels(CORNERS, np.array([[0, 1, 2, 3]]), Views)
-    distance = np.linalg.norm(Views.camera_to_world[0, :3, 3] - CORNERS[:4].mean(axis=0))  # the fifth is of no tet
+    center = CORNERS[:4].mean(axis=0)  # the fifth is of no tet
+    distance = np.linalg.norm(Views.camera_to_world[0, :3, 3] - center)
     np.testing.assert_allclose(pixels[0], np.sqrt(2) * 100 / distance)
 
 
