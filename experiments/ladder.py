@@ -171,6 +171,8 @@ def bake_or_reuse(trained: Trained, workdir: Path) -> tuple[BakedImpostor, Row]:
     """Bake a method's impostor, or take what an earlier run left in `workdir`; and the row of the table."""
     config = trained.scene.config
     row_file, file = (workdir / name for name in ("row.json", "baked.npz"))
+    if not row_file.exists():  # a baking that was refused or cut off has left nothing of its settings
+        (workdir / "config.gin").unlink(missing_ok=True)
     _claim(workdir, operative_config_text(config), trained.impostor.tables.features)  # type: ignore[union-attr]
     if row_file.exists():
         print(f"{workdir}: baked already")

@@ -81,7 +81,7 @@ def main(argv: Sequence[str]) -> None:
     given = args.cage or [None] * len(folders)
     cages = [cage_of(*each, config, args.quick) for each in zip(args.scene, given, folders, strict=True)]
     rows: list[Row] = []
-    refused: list[str] = []
+    refused: dict[str, ValueError] = {}
     for scene, folder, cage in zip(args.scene, folders, cages, strict=True):
         for resolution in resolutions:
             place = folder / f"{resolution}"
@@ -90,7 +90,7 @@ def main(argv: Sequence[str]) -> None:
                 config = config_of(method, resolution, args.gin_configs, bindings)
                 trained = train_or_reuse(method, config, scene, cage, place / method)
                 of_scene.append(trained.row)
-                if method == "FeatInt":
+                if method == "FeatInt" and not args.no_bake:
                     source = trained
             views = trained.scene.test
             del trained  # pictures and pixels, which baking needs the memory of
@@ -100,15 +100,16 @@ def main(argv: Sequence[str]) -> None:
                 try:
                     of_scene.append(bake_or_reuse(source, place / "Baked")[1])
                 except ValueError as error:  # of this scene: the others need not wait
-                    refused.append(f"{scene} at {resolution}: {error}")
-                    print(f"no row of {refused[-1]}")
+                    refused[f"{scene} at {resolution}: {error}"] = error
+                    print(f"no row of {scene} at {resolution}: {error}")
                 del source
             rows += compared(of_scene)
             runs = [place / row["method"] for row in of_scene]
             write_picture(folder / f"{resolution}.png", views, runs)
             write_table(args.out / "table2", rows, COLUMNS, notes(rows))
     if refused:
-        raise ValueError(f"{len(refused)} of the baked rows are missing; {'; '.join(refused)}")
+        message = f"{len(refused)} of the baked rows are missing; {'; '.join(refused)}"
+        raise ValueError(message) from next(iter(refused.values()))
 
 
 def compared(rows: Sequence[Row]) -> list[Row]:

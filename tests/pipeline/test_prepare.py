@@ -95,5 +95,8 @@ def test_a_built_cage_is_taken_again_with_its_own_settings_alone(tmp_path):
     config = ExperimentConfig(cage=CageConfig(target_tets=300))
     with pytest.raises(ValueError, match=r"cage\.npz was built with CageConfig.target_tets = 100, not 300"):
         prepare(config, "nowhere", cage=path, cage_output=path)  # before anything else is read
+    check_built(path, CageConfig(target_tets=100, max_missed_share=0.1))  # asked anew of all views
     save_tets(path, *cage)  # from elsewhere
     check_built(path, own)
+    save_tets(tmp_path / "cage.vtu", *cage, settings_of(own))  # which keeps none
+    check_built(tmp_path / "cage.vtu", own)

@@ -73,7 +73,7 @@ def save_tets(
 def cage_settings(path: str | Path) -> str | None:
     """What an `.npz` cage says that it was built with; None where it does not. Errors as `load_tets`."""
     check_exists(Path(path), "cage")
-    settings = _arrays(Path(path)).get("settings")
+    settings = _arrays(Path(path)).get("settings") if Path(path).suffix == ".npz" else None
     return None if settings is None else str(settings)
 
 

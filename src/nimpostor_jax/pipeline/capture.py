@@ -130,7 +130,7 @@ def affordable_size(width: int, height: int, count: int, log: Log = print) -> tu
     small = max(1, int(width * share**0.5))
     log(
         f"{count} images of {width} x {height} are reduced to {small} pixels in width, for memory; "
-        "DataConfig.resolution asks for another"
+        "DataConfig.resolution asks for another, in a new --workdir"
     )
     return small, max(1, round(height * small / width))
 

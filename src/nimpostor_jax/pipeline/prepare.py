@@ -228,13 +228,15 @@ def load_cage(
 
 def settings_of(config: CageConfig) -> str:
     """What the file of a cage that was built says of itself (`save_tets`)."""
-    return json.dumps(to_dict(config))
+    values = to_dict(config)
+    del values["max_missed_share"]  # asked again of every set of views
+    return json.dumps(values)
 
 
 def check_built(path: str | Path, config: CageConfig) -> None:
     """Raise ValueError where a cage was built with other settings; cages from elsewhere do not say."""
     there = json.loads(cage_settings(path) or "{}")
-    for name, value in to_dict(config).items():
+    for name, value in json.loads(settings_of(config)).items():
         if there.get(name, value) != value:
             raise ValueError(
                 f"{path} was built with CageConfig.{name} = {there[name]!r}, not {value!r}; "
